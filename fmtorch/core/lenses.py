@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
+Behind = bool | NDArray[np.bool_]
 Distortion = Callable[..., tuple[Matrix, Matrix]]
 _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced by its limit
 
@@ -44,17 +45,18 @@ class Lens:
         """Whether the image differs from a pinhole's."""
         return MODELS[self.model].fisheye or any(self.coefficients)
 
-    def distort(self, points: Matrix) -> Matrix:
-        """Where points (..., 2) of the undistorted image are in the photograph, both in pixels."""
+    def distort(self, points: Matrix, behind: Behind = False) -> Matrix:
+        """Where points (..., 2) of the undistorted image are in the photograph, both in pixels.
+        behind: which of them stand for what is behind the camera, as those of `lines_of_sight` do."""
         u, v = (points[..., 0] - self.cx) / self.fx, (points[..., 1] - self.cy) / self.fy
-        u, v = MODELS[self.model].distort(u, v, *self.coefficients)
+        w = np.where(behind, -1.0, 1.0)
+        u, v = MODELS[self.model].photographed(w * u, w * v, w, self.coefficients)
         return np.stack([self.fx * u + self.cx, self.fy * v + self.cy], -1)
 
-    def derivatives(self, points: Matrix) -> Matrix:
-        """The derivatives (..., 2, 2) of `distort` there, by central differences."""
-        steps = STEP * np.diag([self.fx, self.fy])
-        moved = [(self.distort(points + step) - self.distort(points - step)) / (2 * step.sum()) for step in steps]
-        return np.stack(moved, -1)
+    def derivatives(self, points: Matrix, behind: Behind = False) -> Matrix:
+        """The derivatives (..., 2, 2) of `distort` there."""
+        slant = 1 + (((points - [self.cx, self.cy]) / [self.fx, self.fy]) ** 2).sum(-1, keepdims=True)
+        return _derivatives(lambda x: self.distort(x, behind), points, STEP * self.fx * slant)
 
     def scaled(self, sx: float, sy: float) -> "Lens":
         """The lens of the photograph whose width and height are resampled to so many times theirs."""
@@ -66,12 +68,14 @@ class Lens:
 class Model:
     """A lens model.
     focals: whether it has one focal length or two. coefficients: names of its parameters after the principal point.
-    fisheye: whether it bends even where all of them are zero."""
+    distort: of points (u, v) of a pinhole's image, or where it is a fish-eye, which bends even where all coefficients
+    are zero, of angles to the axis; or of rays (u, v, w), where `rays` is its inverse."""
 
     focals: int
     coefficients: str
     distort: Distortion
     fisheye: bool = False
+    rays: Callable[..., tuple[Matrix, Matrix, Matrix]] | None = None
 
     @property
     def parameters(self) -> list[str]:
@@ -84,11 +88,32 @@ class Model:
         cx, cy = values[self.focals : self.focals + 2]
         return Lens(float(fx), float(fy), float(cx), float(cy), name, tuple(map(float, values[self.focals + 2 :])))
 
+    def photographed(self, u: Matrix, v: Matrix, w: Matrix, coefficients: Sequence[float]) -> tuple[Matrix, Matrix]:
+        """Where a lens of focal length 1 puts rays (u, v, w) of any length."""
+        if self.rays is not None:
+            return self.distort(u, v, w, *coefficients)
+        if self.fisheye:
+            r = np.hypot(u, v)
+            angle = np.where(r * r < _TINY, 1.0, np.arctan2(r, w) / np.maximum(r, _TINY))
+            u, v = u * angle, v * angle
+        return self.distort(u, v, *coefficients)
 
-def radial(u: Matrix, v: Matrix, k1: float = 0.0, k2: float = 0.0) -> tuple[Matrix, Matrix]:
-    """A polynomial in the squared radius; without coefficients, a pinhole."""
-    r2 = u * u + v * v
-    factor = 1 + r2 * (k1 + r2 * k2)
+    def rays_of(self, x: Matrix, coefficients: Sequence[float]) -> tuple[Matrix, Matrix, Matrix]:
+        """The rays (u, v, w) that it puts at points (n, 2); NaN where there is none."""
+        if self.rays is not None:
+            return self.rays(*x.T, *coefficients)
+        u, v = _inverted(lambda x: np.stack(self.distort(*np.moveaxis(x, -1, 0), *coefficients), -1), x).T
+        if not self.fisheye:
+            return u, v, np.ones_like(u)
+        angle = np.hypot(u, v)
+        sine = np.where(angle < np.pi, np.sinc(angle / np.pi), np.nan)
+        return u * sine, v * sine, np.cos(angle)
+
+
+def radial(u: Matrix, v: Matrix, *k: float) -> tuple[Matrix, Matrix]:
+    """A polynomial in the squared radius with coefficients k; without any, a pinhole, or a fish-eye whose radius is
+    the angle to the axis."""
+    factor = _polynomial(u * u + v * v, k)
     return u * factor, v * factor
 
 
@@ -113,18 +138,9 @@ def field_of_view(u: Matrix, v: Matrix, omega: float) -> tuple[Matrix, Matrix]:
     return u * factor, v * factor
 
 
-def equidistant(u: Matrix, v: Matrix, *k: float) -> tuple[Matrix, Matrix]:
-    """The radius is the angle to the axis, times a polynomial in its square with coefficients k."""
-    r = np.hypot(u, v)
-    theta = np.arctan(r)
-    factor = np.where(r * r < _TINY, 1.0, theta / np.maximum(r, _TINY)) * _polynomial(theta * theta, k)
-    return u * factor, v * factor
-
-
 def thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
     """A fish-eye whose sensor is tilted (Weng et al., PAMI 1992)."""
     k1, k2, p1, p2, k3, k4, sx1, sy1 = c
-    u, v = equidistant(u, v)
     r2 = u * u + v * v
     du, dv = _decentred(u, v, r2, p1, p2)
     factor = _polynomial(r2, (k1, k2, k3, k4))
@@ -134,24 +150,36 @@ def thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
 def rad_tan_thin_prism(u: Matrix, v: Matrix, *c: float) -> tuple[Matrix, Matrix]:
     """The fish-eye of Project Aria's cameras: six radial, two tangential and four thin-prism coefficients."""
     (p0, p1), (s0, s1, s2, s3) = c[6:8], c[8:]
-    u, v = equidistant(u, v, *c[:6])
+    u, v = radial(u, v, *c[:6])
     r2 = u * u + v * v
     du, dv = _decentred(u, v, r2, p1, p0)
     return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
 
 
-def division(u: Matrix, v: Matrix, k: float) -> tuple[Matrix, Matrix]:
-    """The undistorted point is the distorted one divided by ``1 + k r^2``. NaN beyond the largest radius for k > 0."""
-    root = 1 - 4 * k * (u * u + v * v)
+def division(u: Matrix, v: Matrix, w: Matrix, k: float) -> tuple[Matrix, Matrix]:
+    """A ray's point divided by ``1 + k r^2`` is the undistorted one. NaN beyond the largest radius for k > 0."""
     with np.errstate(invalid="ignore"):
-        factor = 2 / (1 + np.sqrt(root))
+        factor = 2 / (w + np.sqrt(w * w - 4 * k * (u * u + v * v)))
     return u * factor, v * factor
 
 
-def unified(u: Matrix, v: Matrix, alpha: float, beta: float) -> tuple[Matrix, Matrix]:
-    """The enhanced unified camera model (Khomutenko et al., RA-L 2016)."""
-    factor = 1 / (alpha * np.sqrt(beta * (u * u + v * v) + 1) + 1 - alpha)
+def division_rays(u: Matrix, v: Matrix, k: float) -> tuple[Matrix, Matrix, Matrix]:
+    """The inverse of `division`, up to the largest radius of a pinhole's image for k > 0."""
+    bend = k * (u * u + v * v)
+    return u, v, np.where(bend < 1, 1 + bend, np.nan)
+
+
+def unified(u: Matrix, v: Matrix, w: Matrix, alpha: float, beta: float) -> tuple[Matrix, Matrix]:
+    """The enhanced unified camera model (Khomutenko et al., RA-L 2016, eq. 5)."""
+    factor = 1 / (alpha * np.sqrt(beta * (u * u + v * v) + w * w) + (1 - alpha) * w)
     return u * factor, v * factor
+
+
+def unified_rays(u: Matrix, v: Matrix, alpha: float, beta: float) -> tuple[Matrix, Matrix, Matrix]:
+    """The inverse of `unified` (eq. 10); NaN beyond its largest radius."""
+    r2 = beta * (u * u + v * v)
+    root = np.sqrt(1 - (2 * alpha - 1) * r2)
+    return u, v, (1 - alpha * alpha * r2) / (alpha * root + 1 - alpha)
 
 
 def _decentred(u: Matrix, v: Matrix, r2: Matrix, p1: float, p2: float) -> tuple[Matrix, Matrix]:
@@ -165,20 +193,20 @@ def _polynomial(x: Matrix, k: tuple[float, ...]) -> Matrix:
     return 1 + total
 
 
-MODELS = {
+MODELS = {  # the models by name, in the order of the numbers that COLMAP's binary files give them
     "SIMPLE_PINHOLE": Model(1, "", radial), "PINHOLE": Model(2, "", radial),
     "SIMPLE_RADIAL": Model(1, "k", radial), "RADIAL": Model(1, "k1 k2", radial),
-    "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", equidistant, fisheye=True),
+    "OPENCV": Model(2, "k1 k2 p1 p2", rational), "OPENCV_FISHEYE": Model(2, "k1 k2 k3 k4", radial, fisheye=True),
     "FULL_OPENCV": Model(2, "k1 k2 p1 p2 k3 k4 k5 k6", rational), "FOV": Model(2, "omega", field_of_view),
-    "SIMPLE_RADIAL_FISHEYE": Model(1, "k", equidistant, fisheye=True),
-    "RADIAL_FISHEYE": Model(1, "k1 k2", equidistant, fisheye=True),
+    "SIMPLE_RADIAL_FISHEYE": Model(1, "k", radial, fisheye=True),
+    "RADIAL_FISHEYE": Model(1, "k1 k2", radial, fisheye=True),
     "THIN_PRISM_FISHEYE": Model(2, "k1 k2 p1 p2 k3 k4 sx1 sy1", thin_prism, fisheye=True),
     "RAD_TAN_THIN_PRISM_FISHEYE": Model(2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", rad_tan_thin_prism, fisheye=True),
-    "SIMPLE_DIVISION": Model(1, "k", division), "DIVISION": Model(2, "k", division),
-    "SIMPLE_FISHEYE": Model(1, "", equidistant, fisheye=True), "FISHEYE": Model(2, "", equidistant, fisheye=True),
-    "EUCM": Model(2, "alpha beta", unified),
+    "SIMPLE_DIVISION": Model(1, "k", division, rays=division_rays),
+    "DIVISION": Model(2, "k", division, rays=division_rays),
+    "SIMPLE_FISHEYE": Model(1, "", radial, fisheye=True), "FISHEYE": Model(2, "", radial, fisheye=True),
+    "EUCM": Model(2, "alpha beta", unified, rays=unified_rays),
 }  # fmt: skip
-"""The models by name, in the order of the numbers that COLMAP's binary files give them."""
 
 
 # Their inverse
@@ -186,6 +214,7 @@ MODELS = {
 ITERATIONS = 50  # at most; most points take four
 STEP = 1e-6  # of the derivatives, in units of the focal length
 TOLERANCE = 1e-10  # of distorted points, likewise: 1e-7 px at a focal length of 1000 px
+GRAZING = 1e-3  # cotangent of the angle to the axis below which no pinhole's image has the point, in front or behind
 RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens must lead outwards
 
 
@@ -197,46 +226,59 @@ def division_lens(value: float, size: Sequence[float]) -> Lens:
 
 def undistorted_points(lens: Lens, photographed: NDArray[Any]) -> Matrix:
     """Pixels (..., 2) of a pinhole of calibration `lens.K` for those of the photograph; NaN where it sees nothing.
-    The inverse of `Lens.distort` by Newton's method. NaN too where the model folds back between centre and point: there
-    a polynomial has left the range to which it was fitted, as `undistorted` leaves such pixels black."""
+    NaN too where the model folds back between centre and point: there a polynomial has left the range to which it was
+    fitted, as `undistorted` leaves such pixels black."""
+    points, behind = lines_of_sight(lens, photographed)
+    return np.where(behind[..., None], np.nan, points)
+
+
+def lines_of_sight(lens: Lens, photographed: NDArray[Any]) -> tuple[Matrix, NDArray[np.bool_]]:
+    """The same, with what is beyond 90 degrees of the axis, where the line of sight, extended backwards, meets the
+    pinhole's image; and which points (...,) these are. What holds of lines holds of them, as ``x1^T F x0 = 0``."""
     points: Matrix = np.array(photographed, np.float64)
     if not lens.bends:
-        return points
+        return points, np.zeros(points.shape[:-1], np.bool_)
     centre, focal = np.array([lens.cx, lens.cy]), np.array([lens.fx, lens.fy])
-    target = (points.reshape(-1, 2) - centre) / focal
     with np.errstate(all="ignore"):
-        x = _inverted(dataclasses.replace(lens, fx=1.0, fy=1.0, cx=0.0, cy=0.0), target)
-    return np.asarray(x * focal + centre, np.float64).reshape(points.shape)
+        target = (points.reshape(-1, 2) - centre) / focal
+        u, v, w = MODELS[lens.model].rays_of(target, lens.coefficients)
+        w = np.where(np.abs(w) > GRAZING * np.hypot(u, v), w, np.nan)
+        x = np.stack([u / w, v / w], -1) * focal + centre
+    return np.asarray(x.reshape(points.shape), np.float64), np.asarray(w < 0).reshape(points.shape[:-1])
 
 
-def undistortion(lens: Lens, pinhole: Matrix) -> Matrix:
+def undistortion(lens: Lens, pinhole: Matrix, behind: Behind = False) -> Matrix:
     """The derivatives (..., 2, 2) of undistorted points, which these are, by those of the photograph."""
-    (a, c), (b, d) = (np.moveaxis(column, -1, 0) for column in np.moveaxis(lens.derivatives(pinhole), -1, 0))
+    return _inverse(lens.derivatives(pinhole, behind))
+
+
+def _derivatives(function: Callable[[Matrix], Matrix], x: Matrix, step: Any) -> Matrix:
+    """Those (..., 2, 2) of a function of points (..., 2), by central differences."""
+    return np.stack([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(2)], -1)
+
+
+def _inverse(J: Matrix) -> Matrix:
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
     rows = np.stack([d, -b, -c, a], -1) / (a * d - b * c)[..., None]
-    return np.asarray(rows.reshape(*pinhole.shape, 2), np.float64)
+    return np.asarray(rows.reshape(J.shape), np.float64)
 
 
-def _inverted(lens: Lens, target: Matrix) -> Matrix:
-    """Points (n, 2) that the lens puts at the target (n, 2), both in units of the focal length, about the centre.
+def _inverted(distort: Callable[[Matrix], Matrix], target: Matrix) -> Matrix:
+    """Points (n, 2) that a function puts at the target (n, 2), in units of the focal length, by Newton's method.
     Each is a function of its own target alone."""
-    x = target.copy()
-    if MODELS[lens.model].fisheye:  # whose radius is about the angle to the axis
-        angle = np.hypot(target[:, 0], target[:, 1])
-        x = np.where((angle > 0)[:, None], target * (np.tan(angle) / angle)[:, None], target)
-        x = np.where((angle < np.pi / 2)[:, None], x, target)
-    error = lens.distort(x) - target
+    x, error = target.copy(), distort(target) - target
     for _ in range(ITERATIONS):
         size = np.hypot(error[:, 0], error[:, 1])
         if not (size > TOLERANCE).any():
             break
-        move = (undistortion(lens, x) @ error[..., None])[..., 0]
+        move = (_inverse(_derivatives(distort, x, STEP)) @ error[..., None])[..., 0]
         for share in (1.0, 0.25, 0.0625):  # shorter where the error would grow
             trial = x - share * move
-            left = lens.distort(trial) - target
+            left = distort(trial) - target
             better = ((size > TOLERANCE) & (np.hypot(left[:, 0], left[:, 1]) < size))[:, None]
             x, error = np.where(better, trial, x), np.where(better, left, error)
             move = np.where(better, 0.0, move)
-    along = lens.distort(RAY[:, None, None] * x)  # from the centre outwards
+    along = distort(RAY[:, None, None] * x)  # from the centre outwards
     outwards = (np.diff(along, axis=0) * x).sum(-1) > 0
     valid = (np.hypot(error[:, 0], error[:, 1]) <= TOLERANCE) & (outwards.all(0) | ~x.any(1))
     return np.where(valid[:, None], x, np.nan)

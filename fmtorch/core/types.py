@@ -36,18 +36,16 @@ LENS = Rule(
 )
 
 MAX_ROWS = 20  # of a table in a notebook
-RELATED = 1.0
-"""The significance from which on two images are called related; chosen on tuning pairs (docs/concepts/related.md)."""
+RELATED = 1.0  # the significance from which on two images are called related (docs/concepts/related.md)
 
 PAIR_TYPES = ("general", "planar", "rotation", "identical", "unrelated")
-WARNINGS = {
+WARNINGS = {  # what each pair type leaves open
     "general": "",
     "planar": "one plane: matches do not determine F or focal lengths, and leave two poses of known cameras",
     "rotation": "the camera only turns: matches determine neither F nor a translation",
     "identical": "one photograph twice: matches determine neither F nor a pose",
     "unrelated": "the images show nothing in common",
 }
-"""What each pair type leaves open."""
 CONTRADICTED = (
     "far more matches agree without the calibration matrices: they are of other images or of another resolution"
 )
@@ -109,7 +107,9 @@ class Correspondences(Record):
     ratio: the distance of the nearest descriptor over that of the second nearest, in [0, 1], (B, N); smaller is better.
     score: the matcher's own confidence in [0, 1], (B, N); larger is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
-    to its epipolar line, relative to that of a usual match, (B, N), where something supplies it.
+    to its epipolar line, relative to that of a usual match, (B, N), where something supplies it. stretch: derivatives
+    (B, N, 2, 2, 2) of the points of both images by those of photographs, from which they were undistorted; the noise
+    is then the root of their areas times that in the photographs.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
     K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.
@@ -138,6 +138,7 @@ class Correspondences(Record):
     lens: Annotated[Float[Tensor, "b 2 2"], LENS] | None = None
     shared_lens: Bool[Tensor, " b"] | None = None
     score: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
+    stretch: Float[Tensor, "b n 2 2 2"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)

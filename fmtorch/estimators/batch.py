@@ -16,10 +16,10 @@ from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.lens_search import undistorted
 from fmtorch.estimators.models.fundamental import Matrices
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.pair import Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair
+from fmtorch.estimators.pair import Lens, Pair, PixelMatches, bucket, calibration_of, normalize_pair, stretched
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.estimators.refinement import Fit, scale_of
-from fmtorch.geometry.epipolar import SAMPSON, Residual
+from fmtorch.geometry.epipolar import SAMPSON, Residual, mean_stretch
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.kernel import Array, as_array
 from fmtorch.jobs.execution import available
@@ -41,6 +41,7 @@ class Solution(NamedTuple):
     samples: int
     inliers: Array | None = None
     reason: str = ""
+    pair: Pair | None = None
     lens: Array | None = None
     deviation: Array | None = None
     lens_suggested: float = math.nan
@@ -94,7 +95,7 @@ class Estimation:
 
     def put(self, row: Row, solution: Solution) -> None:
         """The solution of a pair as its estimate, or the reason why there is none."""
-        i, matches, pair, slot, needed = row
+        i, matches, pair, slot, needed = row if solution.pair is None else row._replace(pair=solution.pair)
         self.samples[i] = solution.samples
         if solution.fit is None or solution.inliers is None:
             self.reasons[i] = solution.reason
@@ -175,6 +176,7 @@ class Batch(NamedTuple):
     shared: Array
     lens: Array | None
     one_lens: Array
+    stretch: Array | None
 
     @staticmethod
     def of(c: Correspondences) -> "Batch":
@@ -191,7 +193,8 @@ class Batch(NamedTuple):
         lens = None if c.lens is None else np.asarray(_array(c.lens), np.float64)
         one_lens = np.zeros(len(keys), np.bool_) if c.shared_lens is None else c.shared_lens.numpy()
         matches = _array(c.x0), _array(c.x1), c.mask.numpy()
-        return Batch(*matches, prior, noise, ambiguity, sizes, keys, focal, shared, lens, one_lens)
+        stretch = None if c.stretch is None else np.asarray(_array(c.stretch), np.float64)
+        return Batch(*matches, prior, noise, ambiguity, sizes, keys, focal, shared, lens, one_lens, stretch)
 
     def pair(self, i: int) -> PixelMatches:
         """One row, in float64."""
@@ -212,6 +215,9 @@ class Batch(NamedTuple):
         n, frame = len(matches.mask), np.empty(6)
         slots, flat = np.empty(n, np.int64), np.empty(9 * n)
         known = self.prior is not None, self.noise is not None, self.ambiguity is not None
+        stretch = self.stretch if residual is SAMPSON else None
+        if stretch is not None and self.noise is not None:
+            matches = matches._replace(noise=matches.noise / mean_stretch(stretch[i]))
         count = normalize_pair(matches, slots, flat, frame)
         slot, table, (unit, right) = slots[:count], flat[: 9 * count].reshape(9, count), frame[4:].tolist()
         if count < minimal:
@@ -232,7 +238,7 @@ class Batch(NamedTuple):
             table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual, calibration,
             lens=lens,
         )  # fmt: skip
-        return pair, slot
+        return pair if stretch is None else stretched(pair, stretch[i, slot]), slot
 
 
 def _wrong_values(matches: PixelMatches, slot: Array) -> str:

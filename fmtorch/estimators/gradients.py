@@ -19,8 +19,9 @@ from fmtorch.estimators.models.fundamental import Matrices, response_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.refinement import Fit, NoFit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
-from fmtorch.geometry.arithmetic import component_sum, weighted_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt, weighted_sum
 from fmtorch.geometry.cameras import PixelFrame
+from fmtorch.geometry.epipolar import mean_stretch
 from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.normalize import RobustSum
 from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
@@ -202,6 +203,10 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
     prior, noise = take(c.prior), take(c.noise)
     precision = mask.to(torch.float64)
     if noise is not None:
+        stretch = [pair.stretch for pair in pairs if pair.stretch is not None]
+        if c.stretch is not None and stretch:
+            noise = noise / torch.where(mask, mean_stretch(c.stretch[rows], sqrt).gather(1, index), 1)
+            precision = precision / torch.where(mask, _padded(stretch, mask), 1).square()
         precision = precision / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
     weight = precision if prior is None else precision * prior.nan_to_num(0).clamp(0, 1)
     return GraphedMatches(points, mask, precision, weight, prior)

@@ -79,10 +79,10 @@ class StoppingRule:
 
 
 def residuals_squared_px(F: Array, pair: Pair) -> Array:
-    """Squared Sampson distances (n,) to a model (9,) in squared pixels, float64."""
+    """Squared Sampson distances (n,) to a model (9,) in squared pixels of the photographs, float64."""
     out = np.empty(pair.count)
     residuals_squared_of(pair.residual)(F, pair.points, squared(pair.pixels_per_unit), out)
-    return out
+    return out if pair.stretch is None else out / np.square(pair.stretch)
 
 
 def lower_median(values: Array) -> float:
@@ -102,7 +102,9 @@ MIN_PRIOR_FOR_NOISE = 0.3  # matches of a smaller prior do not tell the noise
 def squared_in_noises(F: Array, pair: Pair) -> Array:
     """Squared residuals (n,) in squared pixels, of matches of usual noise."""
     r2 = residuals_squared_px(F, pair)
-    return r2 if pair.noise is None else r2 / np.square(pair.noise)
+    if pair.noise is None:
+        return r2
+    return r2 / np.square(pair.noise if pair.stretch is None else pair.noise / pair.stretch)
 
 
 def fit_distance(r2: Array, own: FitScale) -> float:

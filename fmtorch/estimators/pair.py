@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.epipolar import SAMPSON, Residual
+from fmtorch.geometry.epipolar import SAMPSON, Residual, mean_stretch, stretch_across
 from fmtorch.geometry.matrices import multiply
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -16,7 +16,7 @@ T = TypeVar("T")
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow
 MIN_NOISE, MAX_NOISE = 0.1, 10.0  # of a match, relative to a usual one; what is beyond is taken for these
 SMALLEST_BUCKET = 128
-MATCH_WEIGHT = 6  # row of a pair's table
+MATCH_WEIGHT, STRETCH = 6, 9  # rows of a pair's table
 EXACT = 0.02  # relative deviation below which a focal length counts as exactly known
 
 
@@ -64,15 +64,16 @@ class Pair:
     """The matches of one pair. Arrays are float64 and C-contiguous.
 
     table: (9, n), a row each of x0, y0, x1, y1 in normalised units, weight, pixels per noise, match weight, noise,
-    ambiguity. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each match counts in a
-    fit, its prior divided by the square of its noise. pixels_per_noise: pixels in one normalised unit, divided by
-    the noise. match_weight: what it counts in a score, the prior, or one. prior, noise, ambiguity: (n,), None where
-    the caller has none; noise is between MIN_NOISE and MAX_NOISE. bucket: of the number of matches of the whole
-    pair, which decides how priors are quantised and whether models are preselected. pixels_per_unit: a power of
-    two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
-    key, seed: of every random choice. residual: of the family of models, by which matches are judged. calibration:
-    what is known of the focal lengths, of a pair whose sizes are known; lens: of the lenses, None of pinholes. images:
-    what families compute of the images, for all subsets of the matches."""
+    ambiguity; of undistorted points also by how much their distances are longer than in the photographs, and their
+    eight derivatives by those. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each
+    match counts in a fit, its prior divided by the square of its noise. pixels_per_noise: pixels in one normalised
+    unit, divided by the noise. match_weight: what it counts in a score, the prior, or one. prior, noise, ambiguity:
+    (n,), None where the caller has none; noise, in photographs, is between MIN_NOISE and MAX_NOISE. bucket: of the
+    number of matches of the whole pair, which decides how priors are quantised and whether models are preselected.
+    pixels_per_unit: a power of two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w,
+    pixels; empty where unknown. key, seed: of every random choice. residual: of the family of models, by which matches
+    are judged. calibration: what is known of the focal lengths, of a pair whose sizes are known; lens: of the lenses,
+    None of pinholes. images: what families compute of the images, for all subsets of the matches."""
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
@@ -110,6 +111,11 @@ class Pair:
         return noises
 
     @property
+    def stretch(self) -> Array | None:
+        """By how much distances are stretched (n,), None where points are the photographs' own."""
+        return self.table[STRETCH] if len(self.table) > STRETCH else None
+
+    @property
     def points32(self) -> Array:
         """The points as scores take them, float32."""
         return self.cached("points32", lambda pair: pair.points.astype(np.float32))
@@ -142,6 +148,27 @@ class Pair:
             table, known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre, self.sizes,
             self.residual, self.calibration, self.images, lens,
         )  # fmt: skip
+
+
+def stretched(pair: Pair, J: Array) -> Pair:
+    """The pair of undistorted points, whose derivatives by the photographs' are J (n, 2, 2, 2)."""
+    table = np.concatenate([pair.table, np.ones((1, pair.count)), J.reshape(-1, 8).T])
+    return _stretched_by(pair.with_table(table, pair.known, pair.lens), mean_stretch(J))
+
+
+def across_lines(pair: Pair, F: Array) -> Pair:
+    """The pair whose distances count by how the points are stretched across the epipolar lines of a model (9,)."""
+    if pair.stretch is None:
+        return pair
+    J = pair.table[STRETCH + 1 :].T.reshape(-1, 2, 2, 2)
+    return _stretched_by(pair, np.sqrt(stretch_across(F, pair.points, J)))
+
+
+def _stretched_by(pair: Pair, stretch: Array) -> Pair:
+    table = pair.table.copy()
+    more = stretch / table[STRETCH]
+    table[4], table[5], table[7], table[STRETCH] = table[4] / (more * more), table[5] / more, table[7] * more, stretch
+    return pair.with_table(table, (pair.known[0], True, pair.known[2]), pair.lens)
 
 
 class PixelMatches(NamedTuple):

@@ -22,7 +22,7 @@ from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
 from fmtorch.estimators.models import focal_prior, fundamental, posterior, with_focals
 from fmtorch.estimators.models.fundamental import EightPoint, FitScale, Homography, Matrices, SevenPoint
-from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, normalize_pair, to_pixels
+from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, across_lines, normalize_pair, to_pixels
 from fmtorch.estimators.preselection import Count, Preselect, Preselection
 from fmtorch.estimators.refinement import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.search import Degensac, Search, merge
@@ -277,9 +277,12 @@ class Ransac:
         selection, draws = self.selected(searched(pair))
         if not selection.valid:
             return Solution(None, draws, reason=NOT_SOLVED)
+        pair = across_lines(pair, selection.F)
         inliers = self.inliers(selection.F, pair)
         fit: Fit = self.final(selection, pair, inliers, self.family)
-        return Solution(fit, draws, self.inliers(fit.F, pair) if self.refit_inliers else inliers)
+        if self.refit_inliers:
+            inliers = self.inliers(fit.F, across_lines(pair, fit.F))
+        return Solution(fit, draws, inliers, pair=None if pair.stretch is None else pair)
 
     def _with_lenses(self, pair: Pair, known: Lens) -> Solution:
         """The same of bent photographs: searched in images of pinholes, judged as photographed."""
@@ -348,14 +351,10 @@ def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> scores.Score:
 class CoarseToFine:
     """Coarse-to-Fine RANSAC (Bian et al., BMVC 2019, section 5): the fine estimator sees the inliers of the coarse one.
 
-    A pair that one of them cannot solve is ``ok=False`` with that one's reason; `draws` counts those of both.
+    coarse: an estimator that prunes well, GC-RANSAC or USAC in the paper. fine: one that fits well, LMedS in the paper.
+    A pair that one of them cannot solve is ``ok=False`` with that one's reason; `samples` counts those of both.
     Its significance is that among all matches, also those which the coarse one dropped.
-    Gradients are the fine estimator's: the coarse one only chooses matches.
-
-    Args:
-        coarse: an estimator that prunes well, GC-RANSAC or USAC in the paper.
-        fine: one that fits well, LMedS in the paper.
-    """
+    Gradients are the fine estimator's: the coarse one only chooses matches."""
 
     def __init__(self, *, coarse: Estimator, fine: Estimator) -> None:
         self.coarse, self.fine = coarse, fine
@@ -383,7 +382,7 @@ class CoarseToFine:
 
 # Kernels that two processes compile side by side, by what they share, the slowest to compile at both ends
 
-WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
+WITH_FOCALS: tuple[Kernel[..., Any], ...] = (  # of an estimator of fundamental matrices with the prior on focal lengths
     # Solvers, samples and scores
     five_point, seven_point_kernel, counted_chances, refinement.near_of(SAMPSON), sampling.draw,
     focal_prior.draw_depths, preselection.draw_by_prior, preselection.best, scores.score_gains_of(SAMPSON),
@@ -395,7 +394,6 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
     posterior.minimise, lens_search.inverted, lens_search.minimise_with_lenses,
 )  # fmt: skip
-"""Of an estimator of fundamental matrices with the prior on focal lengths."""
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
     homography_refine.refine_homographies, homography_refine.evaluate_homographies, four_point,

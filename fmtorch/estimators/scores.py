@@ -111,7 +111,8 @@ class SummedGains:
             self.gain_kernel(squared, gains)
         else:
             gains = np.asarray(self.gain(squared))
-        if gains.shape != squared.shape or gains.dtype.kind not in "biuf":
+        numbers = gains.shape == squared.shape and gains.dtype.kind in "biuf"
+        if not numbers or np.isnan(gains[squared < np.inf]).any():
             raise ValueError(
                 f"{type(self).__name__}.gain returns shape {gains.shape} of {gains.dtype}; it must be the shape of its "
                 f"argument, {squared.shape}: (models, matches), of numbers"

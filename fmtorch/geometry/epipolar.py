@@ -6,6 +6,7 @@ all correctly rounded, so a result is bit-equal whatever stands beside it in the
 the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,28 @@ from fmtorch.jit.lanes import lanes, where
 Matrix = Float[Tensor, "*#batch 3 3"]
 Points = Float[Tensor, "*#batch n 2"]
 PerMatch = Float[Tensor, "*#batch n"]
+
+
+def stretch_across(F: Any, points: Any, J: Any) -> Any:
+    """The square of how much longer Sampson's distance is than the tangent Sampson error (Terekhov & Larsson, ICCV
+    2023), which is of photographs: ``(|J0^T l0|^2 + |J1^T l1|^2) / (|l0|^2 + |l1|^2)``, l0 and l1 the epipolar lines'
+    normals; one where there are none. F: (9, ...); points: (4, ..., n); J: (..., n, 2, 2, 2), derivatives of points of
+    both images by the photographs'. Arrays or tensors."""
+    x0, y0, x1, y1 = points
+    lines = [(F[k] * x1 + F[k + 3] * y1 + F[k + 6], F[k + 1] * x1 + F[k + 4] * y1 + F[k + 7]) for k in (0,)]
+    lines += [(F[0] * x0 + F[1] * y0 + F[2], F[3] * x0 + F[4] * y0 + F[5])]
+    there = here = 0.0
+    for k, (a, b) in enumerate(lines):
+        u, v = (a * J[..., k, 0, i] + b * J[..., k, 1, i] for i in (0, 1))
+        there, here = there + (u * u + v * v), here + (a * a + b * b)
+    none = (here == 0) | (there == 0)
+    return (there + none) / (here + none)
+
+
+def mean_stretch(J: Any, sqrt: Callable[[Any], Any] = np.sqrt) -> Any:
+    """The same (...) in the geometric mean of all directions, of derivatives J (..., 2, 2, 2); sqrt: of its type."""
+    areas = abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])
+    return sqrt(sqrt(areas[..., 0] * areas[..., 1]))
 
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

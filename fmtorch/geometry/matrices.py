@@ -14,8 +14,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, outer_sum, sqrt
 from fmtorch.jit.kernel import Array, inner, matrix, vector
 
-GAP = 1e-6
-"""Eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite."""
+GAP = 1e-6  # eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite
 
 
 def nearest_rank2(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -54,6 +54,7 @@ def pose_from_fundamental(
     x1: Points,
     mask: Mask | None = None,
     weight: PerMatch | None = None,
+    behind: Bool[Tensor, "*batch n 2"] | None = None,
 ) -> Pose:
     """Rotation and direction of translation from E = K1^T F K0, of the four decompositions the one with most points
     of positive depth in both cameras.
@@ -71,6 +72,7 @@ def pose_from_fundamental(
         x1: their matches in image 1, (..., N, 2), px.
         mask: (..., N), True for the matches that decide; all by default.
         weight: (..., N), in [0, 1], by which matches count in that decision; all alike by default.
+        behind: (..., N, 2), which points stand for what a lens sees behind camera 0, or 1; none by default.
 
     Returns:
         A `Pose`.
@@ -80,6 +82,8 @@ def pose_from_fundamental(
     keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
     with torch.no_grad():
         ray0, ray1 = (rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
+        if behind is not None:
+            ray0, ray1 = (torch.where(behind[..., k], -ray, ray) for k, ray in enumerate((ray0, ray1)))
         front = _in_front(R, t, ray0, ray1) & keep
         count = support = front.sum(-1)  # (4, *batch)
         if weight is not None:  # whole numbers, whose sums are the same in any order

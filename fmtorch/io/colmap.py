@@ -16,7 +16,7 @@ import torch
 
 from fmtorch.core import lazy
 from fmtorch.core.files import replacing
-from fmtorch.core.lenses import MODELS, Lens, undistorted_points
+from fmtorch.core.lenses import MODELS, Lens, undistorted_points, undistortion
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 from fmtorch.geometry.cameras import MAX_KNOWN_FOCAL, MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
@@ -128,10 +128,10 @@ JUDGED, MIN_SPREAD = 500, 0.05  # keypoints that tell of a lens; median distance
 class DatabaseImage:
     """An image with its keypoints, px, with (0, 0) at the centre of the first pixel.
     size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
-    would have put them, NaN where it sees nothing. deviation: relative, of the focal length of K: 0 where it was
+    would have put them, NaN where it sees nothing. stretch: its derivatives (n, 2, 2), None where it is as stored.
+    deviation: relative, of the focal length of K: 0 where it was
     calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera. warning: what of it is not
-    taken for known. Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they
-    were worth."""
+    taken for known. Scales, orientations and shapes of keypoints are not used (docs/verify.md)."""
 
     name: str
     camera_id: int
@@ -142,6 +142,7 @@ class DatabaseImage:
     pinhole: Singles
     problem: str = ""
     warning: str = ""
+    stretch: Singles | None = None
 
 
 def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
@@ -165,12 +166,14 @@ def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
         K[0, 0] = K[1, 1] = USUAL_FOCAL * max(size)
         deviation = math.inf
     wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
-    pinhole, pixels = points, np.ascontiguousarray(keypoints[:, :2], np.float64)
+    pinhole, stretch, pixels = points, None, np.ascontiguousarray(keypoints[:, :2], np.float64)
     if lens.bends and not (absurd or wrong) and (wrong := _folded(lens, pixels)) == "":
         rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
         pinhole = (rays @ K[:2, :2].T + K[:2, 2]).astype(np.float32)
+        with np.errstate(all="ignore"):
+            stretch = undistortion(lens, rays @ lens.K[:2, :2].T + lens.K[:2, 2]).astype(np.float32)
     problem = f"{whose}: {wrong}" if wrong else ""
-    return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning)
+    return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning, stretch)
 
 
 def _folded(lens: Lens, pixels: Matrix) -> str:
@@ -194,8 +197,7 @@ Ids = tuple[int, int]
 
 class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
-    Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
-    disk is full or another process holds the database."""
+    Raises as `expect_database`, ValueError without keypoints or matches, OSError for a full disk or a held database."""
 
     def __init__(self, path: Path) -> None:
         self._pycolmap = imported()

@@ -1,5 +1,4 @@
-"""Photographs for a pipeline: what is known of their cameras, how they are reduced for matching, and their geometries
-as COLMAP's databases have them."""
+"""Photographs for a pipeline: what is known of their cameras, their reduction, and their geometries for COLMAP."""
 
 import functools
 import math
@@ -32,8 +31,7 @@ WORDS = ("unknown", "shared", "exif")
 
 class PhotographCamera(NamedTuple):
     """What is known of the camera of one photograph.
-    lens: its calibration, with distortion. focal: px, and its relative deviation, where that alone is known. note: what
-    is said of it."""
+    lens: with distortion. focal: px, and its relative deviation, if that alone is known. note: what is said of it."""
 
     lens: Lens | None = None
     focal: tuple[float, float] | None = None
@@ -179,8 +177,7 @@ def reduced_cameras(
 ) -> dict[str, Tensor]:
     """What is known of the cameras of two images as they were reduced, of a batch of one.
     fields: of `camera_fields`, for the originals. scales: of both images in x and y. sizes: (h, w) of the originals.
-    Raises ValueError, naming it, for a K that is no calibration matrix of its image, and for a focal of several
-    pairs."""
+    Raises ValueError, naming it, for a K that is none of its image, and for a focal of several pairs."""
     if "focal" in fields and fields["focal"].shape != (2, 2):
         raise ValueError(f"focal has shape {tuple(fields['focal'].shape)}; it must be of one pair of images")
     reduced = {name: value[None].clone() for name, value in fields.items()}

@@ -28,8 +28,7 @@ class Shared(Protocol):
 
 
 Array = Tensor | NDArray[Any]
-Arrays = Array | Sequence[Any] | Shared
-"""One array, or a list of them: of pairs of different lengths."""
+Arrays = Array | Sequence[Any] | Shared  # one array, or a list of them: of pairs of different lengths
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 Lens = Literal["shared", "unknown"] | float | Arrays | CalibratedLens | None
 
@@ -61,20 +60,10 @@ def correspondences(
     plane: bool = False,
     **fields: Arrays | int | None,
 ) -> Correspondences:
-    """The batch that points and what is known of them and of the cameras describe.
-
-    Args:
-        x0, x1: (N, 2) of one pair, (B, N, 2) of a padded batch, or a list of (N, 2) of different N, in pixels. Whole
-            numbers become float64, half precision float32; x0 decides the device.
-        K0, K1, focal, lens: as of `fmtorch.find_fundamental`.
-        plane: x0 may be in the unit of a plane.
-        fields: of `Correspondences`, or None. Per-match fields come in the form of the points. A size is one for all
-            pairs, (2,), or one each, (B, 2), and so is a key.
-
-    Raises:
-        TypeError: for what is no array of numbers.
-        ValueError: for wrong shapes, values that cannot be, a calibration that is none, and points of no pixels.
-    """
+    """The batch that points and what is known of them and of the cameras describe, as of `fmtorch.find_fundamental`.
+    x0, x1: whole numbers become float64, half precision float32; x0 decides the device. plane: x0 may be in the unit of
+    a plane. fields: of `Correspondences`, or None. Raises TypeError for what is no array of numbers, ValueError for
+    wrong shapes, values that cannot be, a calibration that is none, and points of no pixels."""
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
     if len(c) == 1 and (problem := camera_problems(c)[0]):
@@ -90,7 +79,7 @@ def camera_problems(c: Correspondences) -> tuple[str, ...]:
         if K is None:
             continue
         problems.append(calibration_problems(K, size, f"K{i}"))
-        if size is None and x.shape[1] >= MIN_MATCHES:
+        if size is None and c.stretch is None and x.shape[1] >= MIN_MATCHES:
             known = c.mask if c.focal is None else c.mask & c.focal[:, i, 1:].isfinite()
             off = ((x * K[:, 2:, 2:] - K[:, None, :2, 2]) / K[:, None, (0, 1), (0, 1)]).detach().norm(dim=-1)
             off = torch.where(known & (known.sum(1, keepdim=True) >= MIN_MATCHES), off, torch.nan).nanmedian(1).values

@@ -91,9 +91,10 @@ def find_fundamental(
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
             unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
             K0 or K1 it needs the image sizes. Calibrated lenses are `fmtorch.Lens`, for both images, (lens0, lens1)
-            with None for a pinhole, or a list of (lens0, lens1), one for each pair: points are undistorted, and judged
-            in pixels of the photographs; the K of a lens stands for K0 or K1. Gradients are zero where an estimated or
-            exact lambda is not zero and no plausible cameras agree with the matches.
+            with None for a pinhole, or a list of (lens0, lens1), one for each pair: matches are judged in pixels of the
+            photographs, also what fish-eyes see beyond 90 degrees of their axis; the K of a lens stands for K0 or K1.
+            Gradients are zero where an estimated or exact lambda is not zero and no plausible cameras agree with the
+            matches.
         covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
             said of the cameras these are as of ``focal="unknown"``.
         pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
@@ -146,11 +147,13 @@ def find_fundamental(
     seen = c if lenses is None else lenses.undistorted(c)
     estimate = estimated(seen, "fundamental", estimator, config_dir, seed, options, covariance, assume_sizes)
     if lenses is not None:
-        estimate = lenses.with_reasons(estimate, c, seen)
+        estimate = lenses.completed(estimate, c, seen)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
         warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
-    return with_pair_type(estimate, seen, seed) if pair_type else estimate
+    if not pair_type:
+        return estimate
+    return with_pair_type(estimate, seen if lenses is None else lenses.in_view(seen), seed)
 
 
 def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> "CalibratedLenses | None":
@@ -301,7 +304,7 @@ def find_homography(
     if lenses is None:
         return find(c)
     seen = lenses.undistorted(c)
-    return lenses.with_reasons(find(seen), c, seen)
+    return lenses.completed(find(seen), c, seen)
 
 
 # Homographies of planes in any unit, seen from either side, and whether their support is beyond chance

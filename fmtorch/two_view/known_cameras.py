@@ -14,7 +14,7 @@ from fmtorch.estimators.lens_search import TAIL_DEVIATION
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
 from fmtorch.geometry.cameras import MIN_SIDE_PX, calibration_problems, cross_matrix, mapped, square_pixels
 from fmtorch.geometry.covariance import LensesInPixels, two_view_covariance
-from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.epipolar import inverse_root, mean_stretch, stretch_across
 from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import inverse, pose, pose_from_fundamental
 from fmtorch.geometry.significance import judged
@@ -151,6 +151,11 @@ def _square(c: Correspondences, images: Images) -> Correspondences:
                 A = images.map[:, i, None, :2]
                 columns = (A[..., 0, None] * lafs[..., :1, :] + A[..., 1, None] * lafs[..., 1:, :]).unbind(-1)
                 fields[f"lafs{i}"] = torch.stack([*columns[:2], columns[2] + A[..., 2]], -1).to(lafs.dtype)
+        if c.stretch is not None:
+            A = images.map[..., :2, :2]
+            unit = sqrt(A[..., 0, 0] * A[..., 1, 1])  # of square pixels in those of the photograph
+            by = (A / unit[..., None, None])[:, None].to(c.stretch)
+            fields["stretch"] = component_sum(by[..., :, :, None] * c.stretch[..., None, :, :], -2)
     return c.derived(**fields)
 
 
@@ -173,11 +178,21 @@ def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, c
     lens, unit = estimate.lens, images.unit  # half diagonals are of the images as they were
     fields = {} if lens is None or unit is None else {"lens": lens * (unit.detach() / unit) ** 2}
     if covariance:
-        at = estimate.derived(matrix=F, R=R, t=t).detach()
+        at, square = estimate.derived(matrix=F, R=R, t=t).detach(), _with_noise_across(square, estimate.F.detach())
         fields |= covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
     reasons = tuple(problem or reason for problem, reason in zip(images.problems, estimate.reason, strict=True))
     focals = torch.where(known, focals, torch.nan)
     return estimate.derived(matrix=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons, **fields)
+
+
+def _with_noise_across(c: Correspondences, F: Tensor) -> Correspondences:
+    """The matches with their noise across the epipolar lines of F (b, 3, 3)."""
+    if c.stretch is None or c.noise is None:
+        return c
+    points = torch.cat([c.x0, c.x1], -1).detach().double().movedim(-1, 0)
+    across = sqrt(stretch_across(F.double().flatten(1).T[..., None], points, c.stretch.double()))
+    mean = mean_stretch(c.stretch.double(), sqrt)
+    return c.derived(noise=torch.where(mean > 0, c.noise * across / mean, c.noise))
 
 
 def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,16 +5,23 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from jaxtyping import Bool
+from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.lenses import Lens, Matrix, division, division_lens, undistorted_points, undistortion
+from fmtorch.core.lenses import STEP, Lens, Matrix, division, division_lens, lines_of_sight, undistortion
 from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate
 from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
-from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
+from fmtorch.geometry.cameras import calibration_problems, cross_matrix
+from fmtorch.geometry.epipolar import mean_stretch
+from fmtorch.geometry.pose import pose_from_fundamental
 
-Lenses = tuple[Lens | None, Lens | None]
-"""Of both images of a pair; None of a pinhole."""
+Lenses = tuple[Lens | None, Lens | None]  # of both images of a pair; None of a pinhole
 FORMS = "a lens for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one for each pair"
+
+
+MAX_STRETCH = 100.0  # of a match in both images: 3 degrees from across the axes of fish-eyes
 
 
 class CalibratedLenses:
@@ -63,36 +70,69 @@ class CalibratedLenses:
         """The matches as pinholes would have them; none of a pair whose lens is none."""
         of = range(len(self.pairs)) if len(self.pairs) == len(c) else [0] * len(c)
         valid = torch.tensor([not self.problems[i] for i in of], dtype=torch.bool, device=c.mask.device)
-        return undistorted_matches(c.keep(valid[:, None] & c.mask), [self.pairs[i] for i in of])
+        seen, self.behind = matches_in_sight(c.keep(valid[:, None] & c.mask), [self.pairs[i] for i in of])
+        return seen
 
-    def with_reasons(self, estimate: Estimate, c: Correspondences, seen: Correspondences) -> Estimate:
-        """The estimate of undistorted matches `seen`, with the reasons why it has none of c."""
+    def in_view(self, seen: Correspondences) -> Correspondences:
+        """The undistorted matches that tell the type of a pair: those that are not far off in pinholes' images."""
+        if seen.stretch is None:
+            return seen
+        return seen.keep(mean_stretch(seen.stretch.detach(), sqrt) < MAX_STRETCH)
+
+    def completed(self, estimate: Estimate, c: Correspondences, seen: Correspondences) -> Estimate:
+        """The estimate of undistorted matches `seen`, with the pose of what was seen beyond 90 degrees of an axis, too,
+        and with the reasons why it has none of c."""
+        turned = (self.behind.any(-1) & estimate.inliers).any(1)
+        if estimate.R is not None and all(K is not None for K in self.K) and bool(turned.any()):
+            estimate = self._in_front(estimate, seen, turned)
         reasons, counts = list(estimate.reason), zip(c.count().tolist(), seen.count().tolist(), strict=True)
         for i, (before, after) in enumerate(counts):
             if 2 * after < before and not estimate.ok[i]:
-                unseen = f"pinholes see {after} of {before} matches: the lens folds there, or looks 90 degrees aside"
+                unseen = f"pinholes see {after} of {before} matches: the lens folds there"
                 reasons[i] = self.problems[i if len(self.pairs) > 1 else 0] or unseen
         return estimate.derived(reason=tuple(reasons))
 
+    def _in_front(self, estimate: Estimate, seen: Correspondences, turned: Bool[Tensor, " b"]) -> Estimate:
+        """With the poses in front of which the inliers of these pairs lie; without a covariance of other rotations."""
+        R, t = cast(Tensor, estimate.R), cast(Tensor, estimate.t)
+        K0, K1 = (torch.as_tensor(K).to(estimate.F).expand(len(R), 3, 3) for K in self.K)
+        pose = pose_from_fundamental(estimate.F, K0, K1, seen.x0, seen.x1, estimate.inliers, behind=self.behind)
+        other = (component_sum((R * pose.R).flatten(1), 1) < 3 - STEP) & pose.valid & turned
+        opposite = (component_sum(t * pose.t, 1) < 0) & pose.valid & turned
+        R, t = torch.where(other[:, None, None], pose.R, R), torch.where((other | opposite)[:, None], pose.t, t)
+        fields = {}
+        if estimate.covariance is not None and estimate.tangents is not None:
+            fields["covariance"] = torch.where(other[:, None, None], torch.nan, estimate.covariance)
+            fields["tangents"] = torch.where(opposite[:, None, None], -1, 1) * estimate.tangents
+        return estimate.derived(R=R, t=t, E=matmul3(cross_matrix(t), R), **fields)
+
 
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Correspondences:
-    """The matches of a batch as pinholes of the same K would have them; one that a pinhole does not see is masked.
+    """The matches of a batch as pinholes of the same K would have them; one that a pinhole does not see is masked."""
+    seen, behind = matches_in_sight(c, lenses)
+    return seen.derived(mask=seen.mask & ~behind.any(-1), stretch=None)
+
+
+def matches_in_sight(c: Correspondences, lenses: Sequence[Lenses]) -> tuple[Correspondences, Bool[Tensor, "b n 2"]]:
+    """The same with what is beyond 90 degrees of an axis, where the line of sight meets a pinhole's image behind the
+    camera; and whether a match is there, for both images.
 
     lenses: of each pair. A match's noise grows as its points are stretched, so that its distances count in pixels of
     the photographs: by the root of the determinant of the derivatives of its points, in the geometric mean over both
-    images. Gradients reach the photographs' points."""
-    fields, seen, area = dict[str, Tensor](), np.ones(c.mask.shape, np.bool_), np.ones(c.mask.shape)
+    images, until F tells in which direction (`stretch`). Gradients reach the photographs' points."""
+    fields, seen = dict[str, Tensor](), np.ones(c.mask.shape, np.bool_)
+    behind = np.zeros((*c.mask.shape, 2), np.bool_)
+    stretch = np.broadcast_to(np.eye(2), (*c.mask.shape, 2, 2, 2)).copy()
     for k, (points, lafs) in enumerate(((c.x0, c.lafs0), (c.x1, c.lafs1))):
         x = points.detach().cpu().numpy().astype(np.float64)  # a copy
-        J, bends = np.broadcast_to(np.eye(2), (*x.shape, 2)).copy(), False
+        J, bends = stretch[:, :, k], False
         for i, pair in enumerate(lenses):
             if (lens := pair[k]) is not None and lens.bends:
                 with np.errstate(all="ignore"):
-                    x[i] = undistorted_points(lens, x[i])
-                    J[i], bends = undistortion(lens, x[i]), True
+                    x[i], behind[i, :, k] = lines_of_sight(lens, x[i])
+                    J[i], bends = undistortion(lens, x[i], behind[i, :, k]), True
                 valid = np.isfinite(x[i]).all(-1) & np.isfinite(J[i]).all((-2, -1))
                 x[i, ~valid], J[i, ~valid], seen[i] = 0, 0, seen[i] & valid
-        area *= np.abs(np.linalg.det(J))
         if not bends:
             continue
         there, slope = torch.from_numpy(x).to(points), torch.from_numpy(J).to(points)
@@ -102,11 +142,21 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Corresp
         fields[f"x{k}"] = there
         if lafs is not None:
             fields[f"lafs{k}"] = torch.cat([slope.to(lafs) @ lafs[..., :2], there.detach().to(lafs)[..., None]], -1)
+    turned = torch.from_numpy(behind).to(c.mask.device)
     if not fields:
-        return c
-    fields["mask"] = c.mask & torch.from_numpy(seen).to(c.mask.device)
-    noise = torch.from_numpy(np.sqrt(np.sqrt(np.where(seen & (area > 0), area, 1)))).to(c.x0)
-    return c.derived(**fields, noise=noise if c.noise is None else c.noise * noise)
+        return c, turned
+    return with_stretch(c.derived(**fields), stretch, seen), turned
+
+
+def with_stretch(c: Correspondences, stretch: Matrix, seen: NDArray[np.bool_]) -> Correspondences:
+    """Matches of undistorted points with their derivatives (b, n, 2, 2, 2) by the photographs', and their noise. seen:
+    (b, n), whether a pinhole sees a match."""
+    mean = mean_stretch(stretch)
+    noise = torch.from_numpy(np.where(seen & (mean > 0), mean, 1)).to(c.x0)
+    return c.derived(
+        mask=c.mask & torch.from_numpy(seen).to(c.mask.device), stretch=torch.from_numpy(stretch).to(c.x0),
+        noise=noise if c.noise is None else c.noise * noise,
+    )  # fmt: skip
 
 
 # Homographies of photographs whose lenses are of the division model, with known or unknown lambdas
@@ -162,8 +212,8 @@ def _fitted_lenses(c: Correspondences, models: Matrix) -> Matrix:
         lens0, lens1 = np.broadcast_to(parameters[8:] if len(parameters) > 8 else 0.0, 2).clip(MIN_LENS, MAX_LENS)
         with np.errstate(all="ignore"):
             h = np.c_[x0, 1 + lens0 * (x0**2).sum(1)] @ np.append(parameters[:8], 1.0).reshape(3, 3).T
-            u, v = (h[:, :2] / h[:, 2:]).T
-            there = np.stack(division(u, v, lens1), -1)
+            u, v, w = h.T / h[:, 2]
+            there = np.stack(division(u, v, w, lens1), -1)
         return np.nan_to_num(there - x1, nan=1.0).clip(-1, 1).ravel()
 
     def noise(parameters: Matrix) -> float:  # of a fit

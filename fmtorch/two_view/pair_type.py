@@ -19,8 +19,7 @@ from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 from fmtorch.two_view.known_cameras import calibration
 
-FOCAL_DEVIATION = 0.02
-"""Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+FOCAL_DEVIATION = 0.02  # of the focal lengths of a calibration, relative: what zoom and focus change between two days
 MIN_DEPTH = 0.1  # of points that a lens is said to bend beyond the horizon
 STILL = 0.1  # px of the images as matched: a median motion below it is none
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)

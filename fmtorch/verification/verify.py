@@ -31,9 +31,9 @@ from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
 from fmtorch.pipeline.photographs import pair_geometries
 from fmtorch.two_view import arguments, pair_type
 from fmtorch.two_view.estimation import estimated_by
+from fmtorch.two_view.lenses import with_stretch
 
-Cameras = Literal["stored", "shared", "unknown"]
-"""What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
+Cameras = Literal["stored", "shared", "unknown"]  # what is known: those stored, one focal length, nothing
 _PairIds = tuple[Any, Any]
 
 
@@ -71,8 +71,15 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras, lens: arguments.Len
         c = c.derived(shared_focal=torch.tensor([cameras == "shared" or (stored and same)]))
     if straight:
         return c
-    x0, x1 = (torch.from_numpy(image.pinhole[pair.matches[:, i]])[None] for i, image in enumerate(images))
-    return c.derived(x0=x0, x1=x1, mask=torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1))
+    x = np.stack([image.pinhole[pair.matches[:, i]] for i, image in enumerate(images)], 1)
+    J = np.broadcast_to(np.eye(2), (*x.shape, 2)).copy()
+    for i, image in enumerate(images):
+        if image.stretch is not None:
+            J[:, i] = image.stretch[pair.matches[:, i]]
+    seen: Any = np.isfinite(x).all((1, 2)) & np.isfinite(J).all((1, 2, 3))
+    J[~seen] = 0
+    x0, x1 = (torch.from_numpy(x[None, :, i]) for i in (0, 1))
+    return with_stretch(c.derived(x0=x0, x1=x1, mask=torch.ones_like(c.mask)), J[None], seen[None])
 
 
 class GeometryParts:
@@ -159,8 +166,7 @@ class Verification:
 
 @dataclasses.dataclass(frozen=True)
 class VerifyMode:
-    """How pairs are verified: what is taken for known of cameras and lenses, what is replaced, by whom, which pairs;
-    debug: whether an estimator's error ends the run."""
+    """How pairs are verified, and which, as `verify` takes it; debug: whether an estimator's error ends the run."""
 
     cameras: str = "stored"
     lens: arguments.Lens = None
@@ -342,13 +348,9 @@ def verify(
         seed: of the random numbers.
         config_dir: a folder with presets of your own, as of `find_fundamental`.
         report: called with the pairs done and their number, at the start and after each batch.
-        execution: by which workers, ``fmtorch.jobs.execution.Execution("processes", 4)`` say; None: threads of the
-            estimator. All that is written this process writes.
+        execution: by which workers, ``fmtorch.jobs.Execution("processes", 4)`` say; None: threads of the estimator.
         shard: "2/8" for the second eighth of the pairs. A call without it estimates what is missing and writes all.
         options: replace values of the preset (``inlier_threshold=1.0``).
-
-    Returns:
-        A `Verification` with counts and problems.
 
     Raises:
         FileNotFoundError: where there is no database.

@@ -21,7 +21,7 @@ from fmtorch.core import Correspondences, Estimate, Features, collate, pair_key
 from fmtorch.training import LabelledMatches
 from tests.helpers import same
 
-PER_MATCH = ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise")
+PER_MATCH = ("x0", "x1", "mask", "ratio", "score", "prior", "lafs0", "lafs1", "mutual", "noise", "stretch")
 
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
@@ -37,7 +37,7 @@ def drawn(b: int, seed: int, shapes: dict[str, tuple[int, ...]]) -> tuple[dict[s
 
 
 def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
-    shapes = {"x0 x1": (n, 2), "ratio score prior noise": (n,), "lafs0 lafs1": (n, 2, 3)}
+    shapes = {"x0 x1": (n, 2), "ratio score prior noise": (n,), "lafs0 lafs1": (n, 2, 3), "stretch": (n, 2, 2, 2)}
     fields, g = drawn(b, seed, {**shapes, "K0 K1": (3, 3), "focal lens": (2, 2)})
     mask, mutual = (torch.rand(b, n, generator=g) < share for share in (0.6, 0.5))
     shared = {name: torch.rand(b, generator=g) < 0.5 for name in ("shared_focal", "shared_lens")}
@@ -219,10 +219,9 @@ def test_collate_joins_and_pads_pairs() -> None:
 def test_collate_errors() -> None:
     with pytest.raises(ValueError, match="at least one"):
         collate([])
-    with pytest.raises(TypeError, match="one kind"):
-        collate([matches(), estimate()])
-    with pytest.raises(TypeError, match="one kind"):
-        collate([features(5), batched_features()])
+    for mixed in ([matches(), estimate()], [features(5), batched_features()]):
+        with pytest.raises(TypeError, match="one kind"):
+            collate(mixed)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from fmtorch.core.lenses import lines_of_sight, undistortion
 from fmtorch.data import MODELS, ImageSource, Lens, read_image, undistorted, undistorted_points
 from fmtorch.data.pairs import Resampling
 
@@ -50,6 +51,33 @@ def test_each_model_and_its_inverse_are_colmaps(model: str) -> None:
     both = seen & np.isfinite(theirs).all(-1)
     assert both.sum() > 0.9 * len(points)
     np.testing.assert_allclose(pinhole[both], theirs[both], rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "RADIAL_FISHEYE", "DIVISION", "EUCM"])
+def test_lines_of_sight_all_around(model: str) -> None:
+    """Of a small image, in front of the camera and behind it, by the authors' equations of where a ray meets it."""
+    used, points = Lens(40.0, 40.0, 78.0, 61.5, model, COEFFICIENTS[model]), grid()
+    x, behind = lines_of_sight(used, points)
+    X = np.c_[(x - [78.0, 61.5]) / 40, np.ones(len(x))] * np.where(behind, -1, 1)[:, None]
+    u, r, c = (points - [78.0, 61.5]) / 40, np.hypot(X[:, 0], X[:, 1])[:, None], used.coefficients
+    if model == "EUCM":
+        there = X[:, :2] / (c[0] * np.sqrt(c[1] * r * r + 1) + (1 - c[0]) * X[:, 2:])
+    elif model == "DIVISION":
+        there = X[:, :2] / X[:, 2:] * (1 + c[0] * (u**2).sum(1, keepdims=True))
+        assert ((X[:, :2] * u).sum(1) >= 0).all()
+    else:
+        theta = np.arctan2(r, X[:, 2:])
+        there = X[:, :2] / r * sum(k * theta ** (2 * i + 1) for i, k in enumerate((1.0, *c)))
+    seen = np.isfinite(x).all(1)
+    assert seen.mean() > 0.6
+    assert behind.sum() > 15
+    np.testing.assert_allclose(there[seen], u[seen], atol=1e-7)
+    np.testing.assert_allclose(used.distort(x[seen], behind[seen]), points[seen], atol=1e-6)
+    away = seen & (np.abs(X[:, 2]) > 0.05 * r[:, 0])
+    J = undistortion(used, x[away], behind[away])
+    for axis, step in enumerate(1e-4 * np.eye(2)):
+        ends = [lines_of_sight(used, points[away] + sign * step)[0] for sign in (1, -1)]
+        assert (np.abs(J[..., axis] - (ends[0] - ends[1]) / 2e-4) <= 1e-3 * np.abs(J).max((1, 2))[:, None]).all()
 
 
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:

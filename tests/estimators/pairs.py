@@ -4,14 +4,15 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import torch
 
-from fmtorch.core import Correspondences
+from fmtorch.core import Correspondences, Estimator
 from fmtorch.estimators import Batch, Pair
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.jit.kernel import Array
 from tests.conftest import oracle
-from tests.laws import scene, small
+from tests.laws import quick, scene, small
 from tests.reference.solvers import sampson
 
 SCALES = (1e-9, 1.0, 1e9)
@@ -53,6 +54,14 @@ def real(i: int) -> Correspondences:
     file = oracle("robust.npz")
     x0, x1 = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("X1", "X2"))
     return Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), key=torch.tensor([i]))
+
+
+def quick_or_skip(name: str, *counts: int) -> Estimator:
+    """`laws.quick`; skips the test where a library is not installed."""
+    try:
+        return quick(name, *counts)
+    except ImportError as error:
+        pytest.skip(str(error))
 
 
 def models(pair: Pair, count: int) -> np.ndarray:

@@ -23,7 +23,6 @@ from tests.reference import ransac as reference
 from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit
 
-NAMES = ("scene 40", "scene 300", *REAL)
 RADIUS = 20.0
 RECTIFIED = np.array([0, 0, 0, 0, 0, 1.0, 0, -1, 0])  # r^2 = (y1 - y0)^2 / 2
 PAIRS = 64
@@ -38,7 +37,7 @@ def searched(pair: Pair) -> np.ndarray:
     return Ransac(hypotheses=100, round=50, pool=4).search(pair).models
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["scene 40", "scene 300", *REAL])
 def test_fits_are_those_of_all_inliers_and_of_samples_of_them(name: str) -> None:
     pair, part = named(name, seed=2), GraphCut(1.0, Msac(1.0))
     labels = residuals_squared_px(searched(pair)[0], pair) <= 4.0

@@ -106,6 +106,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     (scored(lambda which: 1.0), "Scored returns float; it must be"),
     (scored(lambda squared: squared[:, :3], Gain), rf"Gain.gain returns shape \(\d+, 3\) of float32{GAINS}"),
     (scored(lambda squared: squared.sum(1), Gain), rf"Gain.gain returns shape \(\d+,\) of float32{GAINS}"),
+    (scored(lambda squared: squared * np.nan, Gain), GAINS),
     (scored(lambda squared: 1.0, Gain), rf"shape \(\) of float64{GAINS}"),
     (scored(lambda squared: squared + 0j, Gain), rf"shape \(\d+, 60\) of complex64{GAINS}"),
     (scored(lambda squared: [["one"] * 60] * len(squared), Gain), rf"shape \(\d+, 60\) of <U3{GAINS}"),

@@ -1,6 +1,5 @@
 """One pair of a batch: its units, what supports a model, and gradients."""
 
-import importlib.util
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -17,8 +16,8 @@ from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
 from fmtorch.presets import merged
 from tests.estimators.models.test_focals import TALL, WIDE, photographs
-from tests.estimators.pairs import SCALES, known, named, normalized, pair_of, real
-from tests.laws import PEERS, degenerate, few, quick, scene, small, with_padding
+from tests.estimators.pairs import SCALES, known, named, normalized, pair_of, quick_or_skip, real
+from tests.laws import degenerate, few, quick, scene, small, with_padding
 from tests.reference.random import number
 from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
@@ -130,12 +129,6 @@ def test_a_part_of_a_pair_keeps_its_frame() -> None:
     assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
 
 
-def estimator(name: str) -> Any:
-    if name in PEERS and importlib.util.find_spec(PEERS[name]) is None:
-        pytest.skip(f"{PEERS[name]} (extra `peers`) is not installed")
-    return quick(name)
-
-
 def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
     """What is ok has a minimal sample of different inliers, off a line, and an F of unit norm; the rest has nothing."""
     points = torch.cat([c.x0, c.x1], -1).to(torch.float64).numpy()
@@ -157,7 +150,7 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
 @pytest.mark.parametrize("name", EVERY)
 def test_few_and_degenerate_matches_of_any_scale_give_a_supported_model_or_a_reason(name: str) -> None:
     kinds = small() | degenerate() | {str(i): scene(100 + i, 20, outliers=1.0) for i in range(3)}
-    usual, built = torch.tensor([kind in RANK_TWO for kind in kinds]), estimator(name)
+    usual, built = torch.tensor([kind in RANK_TWO for kind in kinds]), quick_or_skip(name)
     for scale in (1e-9, 1.0, 1e9) if name in PARTS else (1.0,):
         c = collate([p.replace(**{name: getattr(p, name).double() * scale for name in SCALED}) for p in kinds.values()])
         estimate = built(c, 2)

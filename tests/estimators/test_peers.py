@@ -18,10 +18,8 @@ from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
 from tests.variants import OTHER_LIBRARIES, built, variants
 
-NAMES = [n for n in variants("estimator") if n.startswith(OTHER_LIBRARIES)]
 
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [n for n in variants("estimator") if n.startswith(OTHER_LIBRARIES)])
 def test_recovers_the_geometry_in_a_batch(name: str) -> None:
     if name in PEERS:
         pytest.importorskip(PEERS[name])

@@ -9,12 +9,13 @@ import torch
 
 import fmtorch
 from fmtorch import metrics, presets
-from fmtorch.core import Correspondences, Estimate, Estimator, collate
+from fmtorch.core import Correspondences, Estimate, collate
 from fmtorch.estimators import CoarseToFine, IterativelyReweighted, Ransac
 from fmtorch.geometry import LOSSES, refine, significance
 from fmtorch.geometry.significance import judged
 from fmtorch.jit.kernel import SWITCH, Kernel
 from tests.conftest import oracle
+from tests.estimators.pairs import quick_or_skip
 from tests.helpers import unused
 from tests.laws import few, quick, scene, scenes
 from tests.reference import refine as reference
@@ -282,17 +283,10 @@ def common() -> Correspondences:
     return collate([scene(i, 150, outliers=0.3) for i in range(6)])
 
 
-def estimator(name: str) -> Estimator:
-    try:
-        return quick(name, 400, 200)
-    except ImportError as error:
-        pytest.skip(str(error))
-
-
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_tells_scenes_from_chance(name: str) -> None:
     c, chances = collate([chance(), common()]), len(chance())
-    estimate = estimator(name)(c, seed=1)
+    estimate = quick_or_skip(name, 400, 200)(c, seed=1)
     expected = significance(estimate.F, c.x0, c.x1, c.mask, c.size0, c.size1)
     assert torch.equal(estimate.significance, torch.where(estimate.ok, expected, -torch.inf))
     assert not bool(estimate.related[:chances].any()), estimate.significance[:chances].max()

@@ -16,13 +16,12 @@ from fmtorch.data import ImageSource
 from fmtorch.evaluation import evaluate
 from fmtorch.pipeline import load_pipeline
 from fmtorch.two_view import estimation
-from tests.helpers import draw, pair, small_pipeline
+from tests.helpers import draw, pair, small_pipeline, write_file
 from tests.laws import quick, scene, shown
 from tests.processes import run_command
 from tests.reference import known_cameras
 from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
-EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
 SCENE = known_cameras.scene(7, 200, noise=0.2)
@@ -180,13 +179,10 @@ def test_wrong_types_are_named(tmp_path: Path) -> None:
 
 
 def test_presets_of_ones_own(tmp_path: Path) -> None:
-    for group in ("estimator", "pipeline"):
-        (tmp_path / group).mkdir()
-    file = tmp_path / "estimator" / "mine.yaml"
-    file.write_text("_target_: fmtorch.estimators.Ransac\nthreshold: 0.5\nhypotheses: 100\n")
-    (tmp_path / "pipeline" / "my_pipeline.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - override /estimator: mine\n  - override /pruner: [one_to_one, ratio]\n"
-    )
+    text = "_target_: fmtorch.estimators.Ransac\nthreshold: 0.5\nhypotheses: 100\n"
+    file = write_file(tmp_path / "estimator" / "mine.yaml", text)
+    text = "defaults:\n  - override /estimator: mine\n  - override /pruner: [one_to_one, ratio]\n"
+    write_file(tmp_path / "pipeline" / "my_pipeline.yaml", f"# @package _global_\n{text}")
     x0, x1 = PAIRS[0].x0[0], PAIRS[0].x1[0]
     own = fmtorch.find_fundamental(x0, x1, estimator="mine", config_dir=tmp_path)
     assert torch.equal(own.F, fmtorch.find_fundamental(x0, x1, threshold=0.5, final="least_squares", **FAST).F)
@@ -204,7 +200,7 @@ def test_presets_of_ones_own(tmp_path: Path) -> None:
 
 
 def test_an_empty_batch_gives_an_empty_result() -> None:
-    estimators = {name: quick(name) for name in EVERY}
+    estimators = {n: quick(n) for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])}
     pruners = {name: shown(built("pruner", name)) for name in variants("pruner")}
     for b, n in ((0, 5), (0, 0), (2, 0)):
         numbers, frames, sizes = torch.zeros(b, n), torch.zeros(b, n, 2, 3), torch.ones(b, 2, dtype=torch.int64)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 import fmtorch
 from fmtorch import Lens
@@ -37,6 +39,41 @@ def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
+def surroundings(seed: int, lens: Lens, nearest: float, farthest: float) -> tuple[Array, Array, Array, Array]:
+    """Matches of what is all around, at so many degrees from the axis of a fish-eye, a fifth of them wrong; R and t."""
+    rng, low, high = np.random.default_rng(seed), *np.cos(np.radians([farthest, nearest]))
+    z, azimuth = rng.uniform(low, high, 900), rng.uniform(0, 2 * np.pi, 900)
+    X = np.c_[np.sqrt(1 - z * z)[:, None] * np.c_[np.cos(azimuth), np.sin(azimuth)], z] * rng.uniform(3, 12, (900, 1))
+    R, t = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix(), rng.normal(size=3)
+    t /= np.linalg.norm(t)
+    Y = X @ R.T + t
+    angle = np.degrees(np.arctan2(np.hypot(Y[:, 0], Y[:, 1]), Y[:, 2]))
+    X, Y = (Z[(nearest < angle) & (angle < farthest)][:300] for Z in (X, Y))
+    ends = [lens.distort(Z[:, :2] / Z[:, 2:] @ lens.K[:2, :2] + lens.K[:2, 2], Z[:, 2] < 0) for Z in (X, Y)]
+    x0, x1 = (x + rng.normal(0, 0.5, x.shape) for x in ends)
+    return x0, np.r_[rng.permutation(x1[:60]), x1[60:]], R, t
+
+
+@pytest.mark.parametrize(("nearest", "farthest"), [(0, 75), (0, 100), (80, 100), (95, 120)])
+def test_rays_beyond_90_degrees(nearest: float, farthest: float) -> None:
+    """In front or behind: the rotation and the direction, with its sign, of nine scenes of ten, and most inliers."""
+    lens = Lens(300.0, 310.0, 700.0, 690.0, "OPENCV_FISHEYE", (0.01, -0.002, 0.0, 0.0))
+    scenes = [surroundings(seed, lens, nearest, farthest) for seed in range(10)]
+    together = fmtorch.find_essential(
+        [x0 for x0, *_ in scenes], [x1 for _, x1, *_ in scenes], lens=lens, pair_type=True
+    )
+    right = []
+    for i, (x0, x1, R, t) in enumerate(scenes):
+        pose = together[i]
+        if i < 3:
+            assert torch.equal(pose.R, fmtorch.find_essential(x0, x1, lens=lens).R)
+        turned = np.degrees(Rotation.from_matrix(R.T @ pose.R[0].numpy()).magnitude())
+        off = np.degrees(np.arccos(np.clip(t @ pose.t[0].numpy(), -1, 1)))
+        seen = pose.inliers[0, 60:].float().mean() > 0.95 and pose.pair_type == ("general",)
+        right.append(turned < 0.3 and off < 1.5 and seen)
+    assert sum(right) >= 9
+
+
 def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
     """Undistorted points, and the noise of the matches."""
     ends, noise = [x0, x1], np.ones(len(x0))
@@ -45,6 +82,20 @@ def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tu
             ends[i] = undistorted_points(lens, ends[i])
             noise *= np.abs(np.linalg.det(lens.derivatives(ends[i]))) ** -0.25
     return ends[0], ends[1], noise
+
+
+def residuals(F: Array, lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> Array:
+    """Tangent Sampson errors, px: the epipolar constraint over its slope in the photographs, by differences."""
+
+    def constraint(x: Array) -> Array:
+        ends = [x[:, :2], x[:, 2:]]
+        seen = [end if lens is None else undistorted_points(lens, end) for lens, end in zip(lenses, ends, strict=True)]
+        h0, h1 = (np.c_[end, np.ones(len(end))] for end in seen)
+        return np.einsum("ni,ij,nj->n", h1, F, h0)
+
+    x = np.c_[x0, x1]
+    slopes = [(constraint(x + step) - constraint(x - step)) / 0.02 for step in 0.01 * np.eye(4)]
+    return constraint(x) / np.linalg.norm(slopes, axis=0)
 
 
 @pytest.mark.parametrize("lenses", [(FISHEYE, FISHEYE), (RADIAL, FISHEYE), (RADIAL, None)])
@@ -56,15 +107,19 @@ def test_points_are_as_undistorted_by_hand(lenses: tuple[Lens, Lens | None]) -> 
     assert np.array_equal(x0, before)
     y0, y1, noise = by_hand(lenses, x0, x1)
     K = {"K0": lenses[0].K, "K1": (lenses[1] or PINHOLE).K}
-    known = fmtorch.find_fundamental(y0, y1, noise=noise, **K, covariance=True)
-    torch.testing.assert_close(given.inliers, known.inliers)
-    torch.testing.assert_close(given.F, known.F, rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(given.t, known.t, rtol=1e-5, atol=1e-7)
+    known = fmtorch.find_fundamental(y0, y1, noise=noise, **K)
+    r = residuals(known.F[0].numpy(), lenses, x0, x1)
+    noise = np.abs(residuals(known.F[0].numpy(), (None, None), y0, y1) / r)
+    known = fmtorch.find_fundamental(y0, y1, noise=noise, **K)
+    assert_close(given.F, known.F, rtol=0, atol=2e-5)
+    assert_close(given.t, known.t, rtol=0, atol=2e-3)
+    r = residuals(given.F[0].numpy(), lenses, x0, x1)
+    assert given.inliers[0].tolist() == (np.abs(r) <= 1.5).tolist()
     assert given.pair_type == ("general",)
     truth = torch.nn.functional.normalize(torch.tensor([-0.8, 0.1, 0.3]).double(), dim=0)
     assert torch.rad2deg(torch.arccos(given.t[0] @ truth)) < 1
     pose = fmtorch.find_essential(x0, x1, lens=lenses, **second)
-    torch.testing.assert_close(pose.t, given.t, rtol=0, atol=0.02)
+    assert_close(pose.t, given.t, rtol=0, atol=0.02)
 
 
 def test_a_lens_that_does_not_bend_changes_nothing() -> None:
@@ -201,7 +256,7 @@ def test_a_known_lambda_of_a_plane(lens: Any) -> None:
     half = float(np.hypot(*SIZE)) / 2
     models = [Lens(half, half, 319.5, 239.5, "SIMPLE_DIVISION", (value,)) for value in pair]
     y0, y1, noise = by_hand((models[0], models[1]), x0, x1)
-    torch.testing.assert_close(known.H, fmtorch.find_homography(y0, y1, noise=noise).H, rtol=1e-4, atol=1e-6)
+    assert_close(known.H, fmtorch.find_homography(y0, y1, noise=noise).H, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("lens", "which"), [(-0.1, "shared"), (-0.3, "shared"), ((-0.2, 0.0), "unknown")])
@@ -262,4 +317,4 @@ def test_frames_go_with_their_points() -> None:
     ratio = np.linspace(0.3, 0.9, len(x0))
     estimate = fmtorch.find_essential(x0, x1, lens=RADIAL, ratio=ratio, lafs0=before[0], lafs1=before[1])
     known = fmtorch.find_essential(y0, y1, *[RADIAL.K] * 2, noise=noise, ratio=ratio, lafs0=after[0], lafs1=after[1])
-    torch.testing.assert_close(estimate.F, known.F, rtol=1e-5, atol=1e-7)
+    assert_close(estimate.F, known.F, rtol=1e-3, atol=5e-6)  # along all directions alike

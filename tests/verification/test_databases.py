@@ -18,6 +18,7 @@ import fmtorch
 from fmtorch.core import pair_key
 from fmtorch.data import MODELS
 from fmtorch.io import EXIF_DEVIATION, MatchDatabase, database_image
+from tests.reference.known_cameras import angle
 from tests.verification import databases
 from tests.verification.databases import SIZE, killed_and_continued, plain, read, scene, write
 
@@ -30,15 +31,10 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "database.db"
 
 
-def angle(R: np.ndarray) -> float:
-    """Degrees."""
-    return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
-
-
 def off(geometry: Any, cameras: databases.Scene, i: int = 0, j: int = 1) -> tuple[float, float]:
     """Degrees between the rotation of a geometry and the true one, and between the directions of translation."""
     (R, t), pose = cameras.relative(i, j), geometry.cam2_from_cam1
-    return angle(R.T @ pose.rotation.matrix()), float(np.degrees(np.arccos(np.clip(pose.translation @ t, -1, 1))))
+    return angle(pose.rotation.matrix(), R), float(np.degrees(np.arccos(np.clip(pose.translation @ t, -1, 1))))
 
 
 def keypoints(path: Path, *images: int) -> list[np.ndarray]:

@@ -15,6 +15,7 @@ from fmtorch import presets
 from fmtorch.core import Correspondences, Estimate, pair_key
 from fmtorch.jobs import Execution
 from fmtorch.verification import verify as verification
+from tests.helpers import write_file
 from tests.verification import databases
 from tests.verification.databases import SIZE, Scene, killed_and_continued, matches, plain, read, scene
 
@@ -154,8 +155,7 @@ class FailsOnFew:
 
 
 def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
-    (tmp_path / "estimator").mkdir()
-    (tmp_path / "estimator" / "mine.yaml").write_text(f"_target_: {__name__}.FailsOnFew\nminimum: 50\n")
+    write_file(tmp_path / "estimator" / "mine.yaml", f"_target_: {__name__}.FailsOnFew\nminimum: 50\n")
     x0, x1 = points()[0]
     arrays = {"a/x0": x0, "a/x1": x1, "b/x0": x0[:40], "b/x1": x1[:40]}
     output = tmp_path / "verified.npz"
