@@ -43,7 +43,7 @@ def _opened(path: str, modified: int, threads: int) -> Any:
 # Networks that other libraries fetch
 
 Network = TypeVar("Network")
-PUBLISHED = {
+PUBLISHED = {  # SHA-256 of the publishers' files; DISK's epipolar-save.pth alone is not checked
     "aliked-n16.pth": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
     "aliked-n16rot.pth": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
     "aliked-n32.pth": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
@@ -51,8 +51,9 @@ PUBLISHED = {
     "depth-save.pth": "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
     "disk_lightglue.pth": "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+    "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+    "xfeat-lighterglue.pt": "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
 }
-"""SHA-256 of the publishers' files; DISK's epipolar-save.pth alone is not checked."""
 
 
 def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str, kept_as: str = "") -> Network:

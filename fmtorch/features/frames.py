@@ -11,8 +11,7 @@ from torch import Tensor
 
 from fmtorch.features.patches import PATCH, ImagePyramid, frame_scale, make_upright, rotate_frames
 
-PatchFunction = Callable[[Tensor], Tensor]
-"""Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
+PatchFunction = Callable[[Tensor], Tensor]  # patches (N, 1, 32, 32) float32 in [0, 1] -> (N, D): `PatchNetwork`
 
 BINS = 36  # of the orientation histogram, 10 degrees each; Lowe, IJCV 2004, section 5
 WINDOW = PATCH / 6  # pixels, sigma of the Gaussian window: 2 keypoint sigmas
@@ -22,8 +21,7 @@ SMOOTHING = 1.6  # bins, sigma of the histogram's blur; kornia's
 
 @dataclasses.dataclass(frozen=True)
 class DominantGradient:
-    """Turns the first axis to the highest peak of the histogram of gradient directions (Lowe, IJCV 2004, section 5).
-    One orientation a frame, as kornia's PatchDominantGradientOrientation."""
+    """Turns the first axis to the highest peak of gradient directions (Lowe, IJCV 2004, section 5), one a frame."""
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
         return rotate_frames(lafs, dominant_gradient(pyramid.extract(lafs)))
@@ -31,8 +29,7 @@ class DominantGradient:
 
 @dataclasses.dataclass(frozen=True)
 class NetworkOrientation:
-    """Turns the first axis to the direction that OriNet sees (Mishkin et al., ECCV 2018).
-    network: patches (N, 1, 32, 32) -> (N, 2), a vector (y, x)."""
+    """Turns the first axis as OriNet says (Mishkin et al., ECCV 2018): patches (N, 1, 32, 32) -> (y, x), (N, 2)."""
 
     network: PatchFunction
 

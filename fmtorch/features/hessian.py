@@ -31,8 +31,7 @@ def refined_maxima(
     """The maxima among `seeds`, samples (level, y, x), refined to sub-sample positions, float64, and responses.
     A seed is a maximum where it exceeds the neighbours before it in memory and no neighbour after it exceeds it, so
     that of equal neighbours one remains. A maximum moves to the sample nearest to the quadratic's; it is dropped where
-    it leaves the volume, does not settle, the quadratic has no maximum, or its value is at most `threshold`. Of those
-    that end at one sample one remains."""
+    it leaves the volume, does not settle, has no maximum, or one of at most `threshold`. One remains at a sample."""
     chunks = [_refine(volume, part) for part in torch.split(seeds, CHUNK)] or [_refine(volume, seeds)]
     at, offset, value = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     kept = value > threshold
@@ -163,8 +162,7 @@ class HessianDetector:
     """Detects bright and dark blobs; an instance may be used by several threads.
 
     The response is ``sigma^4 (Ixx Iyy - Ixy^2)`` of intensities in [0, 1] in the Gaussian scale space. Octaves are
-    halved without interpolation: pixel x of an octave is pixel 2x of the one before. A keypoint is a maximum among its
-    26 neighbours, refined by the quadratic through them.
+    halved without interpolation. A keypoint is a maximum of 26 neighbours, refined by the quadratic through them.
 
     max_features: the strongest that are kept, over the whole image and all scales. threshold: least response.
     levels: scales per octave. sigma: blur of the first level of an octave, in its pixels; the smallest keypoint has
@@ -178,8 +176,7 @@ class HessianDetector:
 
     def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
         """Upright frames of half side `FRAME_SIGMAS` sigma and responses, strongest first.
-        image: grey (H, W) or RGB (H, W, 3) uint8. N = 0 where nothing is found. Memory: about 32 bytes a pixel.
-        Raises ValueError for another type, shape or an empty image."""
+        image: grey (H, W) or RGB (H, W, 3) uint8, not empty, else ValueError. Memory: about 32 bytes a pixel."""
         grey = torch.from_numpy(as_grey(image))
         height, width = grey.shape
         by_octave = [(torch.zeros(0, 3).double(), torch.zeros(0))]

@@ -1,6 +1,6 @@
-"""Learned detectors and descriptors of others, through kornia: DISK and ALIKED, for comparison."""
+"""Learned detectors and descriptors of others, through kornia: DISK, ALIKED and XFeat, for comparison."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import kornia
 import numpy as np
@@ -17,7 +17,7 @@ SMALLEST = 32  # px, the shorter side: the networks reduce the image 16 and 32 t
 
 
 class _NetworkFeatures:
-    """What the two have in common: pixels in, unit-length descriptors out, no frames but positions.
+    """What they have in common: pixels in, unit-length descriptors out, no frames but positions.
     identity: what defines the results, for caches. For any number of threads."""
 
     def __init__(self, network: nn.Module, device: str, **options: int | float) -> None:
@@ -29,8 +29,8 @@ class _NetworkFeatures:
     def __call__(self, image: Image) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
         lafs: circles of one pixel, which say nothing of scale or orientation: give them to no pruner. scores: the
-        network's. descriptors: (N, 128) of unit length. Raises ValueError for an image of another type or shape or
-        with a side below `SMALLEST`."""
+        network's. descriptors: (N, 128), of XFeat (N, 64), of unit length. Raises ValueError for an image of another
+        type or shape or with a side below `SMALLEST`."""
         keypoints, scores, descriptors = self._run(self._tensor(image))
         lafs = torch.cat([torch.eye(2).to(keypoints).expand(len(keypoints), 2, 2), keypoints[..., None]], -1)
         size = torch.tensor(image.shape[:2], dtype=torch.int64, device=self.device)
@@ -84,8 +84,7 @@ class ALIKED(_NetworkFeatures):
     """ALIKED (Zhao et al., TIM 2023): sub-pixel keypoints, descriptors of 128 numbers.
     weights: `aliked-n16`, `aliked-n16rot`, `aliked-n32` or `aliked-t16` (whose descriptors have 64 numbers).
     max_features: the strongest kept. score_threshold: least score, in (0, 1). radius: of the non-maximum suppression,
-    in pixels. device: auto, cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights
-    cannot be fetched."""
+    in pixels. device, network, errors: as of `DISK`."""
 
     def __init__(
         self,
@@ -115,3 +114,31 @@ class ALIKED(_NetworkFeatures):
         outputs = (detected.keypoints, detected.keypoint_scores, detected.descriptors)
         keypoints, scores, descriptors = (output[kept].clone() for output in outputs)
         return keypoints, scores, descriptors
+
+
+class XFeat(_NetworkFeatures):
+    """XFeat (Potje et al., CVPR 2024): whole pixels of the image resized to sides divisible by 32, descriptors of 64
+    numbers. max_features: the strongest kept. score_threshold: least keypoint probability, in (0, 1). device: auto,
+    cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights cannot be fetched."""
+
+    def __init__(
+        self,
+        max_features: Annotated[int, Within(1)] = 2048,
+        score_threshold: float = 0.05,
+        device: str = "auto",
+        network: nn.Module | None = None,
+    ) -> None:
+        network = network or pretrained(
+            lambda: kornia.feature.XFeat.from_pretrained(detection_threshold=score_threshold),
+            "XFeat", "github.com/verlab/accelerated_features", "xfeat.pt",
+        )  # fmt: skip
+        self.max_features = max_features
+        super().__init__(network, device, max_features=max_features, score_threshold=score_threshold)
+
+    def _run(self, image: Float[Tensor, "1 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        with torch.inference_mode():
+            (detected,) = cast(Any, self.network).detectAndCompute(image, top_k=self.max_features)
+        sides = torch.tensor([image.shape[3], image.shape[2]]).to(image)
+        scale = sides / (sides // 32 * 32)  # by which kornia multiplies keypoints; a pixel's centre is at a half
+        keypoints = detected["keypoints"] + (scale - 1) / 2
+        return keypoints, detected["scores"].clone(), detected["descriptors"].clone()

@@ -60,8 +60,7 @@ class PatchNetwork:
 
     def __call__(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
         """The network's output for each patch, float32, on the patches' device.
-        Raises NetworkFileError for a file that is absent, corrupt or takes another shape, ValueError for patches of
-        another shape."""
+        Raises NetworkFileError for a file that is absent, corrupt or of another shape, ValueError for other patches."""
         if patches.ndim != 4 or tuple(patches.shape[1:]) != PATCH_SHAPE:
             raise ValueError(f"patches are {tuple(patches.shape)}; a patch network takes (N, 1, 32, 32)")
         session, name, outputs = _session(self.path, self.threads)
@@ -113,10 +112,8 @@ class Detector(Protocol):
     def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]: ...
 
 
-FrameStep = Callable[[ImagePyramid, Tensor], Tensor]
-"""An image and frames (n, 2, 3) -> the same frames with another shape or orientation."""
-Descriptor = Callable[[ImagePyramid, Tensor], Tensor]
-"""An image and frames (n, 2, 3) -> a descriptor of each (n, d)."""
+FrameStep = Callable[[ImagePyramid, Tensor], Tensor]  # frames (n, 2, 3) -> others in shape or orientation
+Descriptor = Callable[[ImagePyramid, Tensor], Tensor]  # frames (n, 2, 3) -> a descriptor of each (n, d)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,8 +166,7 @@ class LocalFeature:
 
 Part = TypeVar("Part")
 Options = Mapping[str, Any]
-Choice = str | Options
-"""A part's name, or a mapping with its `name` and options."""
+Choice = str | Options  # a part's name, or a mapping with its `name` and options
 
 
 def local_feature(

@@ -13,14 +13,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 PATCH_SIZE = 32
-Layout = Sequence[tuple[int, int]]
-"""Channels and stride of each 3 x 3 convolution before the last."""
+Layout = Sequence[tuple[int, int]]  # channels and stride of each 3 x 3 convolution before the last
 
 
 def l2net_layout(width: int) -> Layout:
     """L2-Net's six 3 x 3 convolutions (Tian, Fan, Wu, CVPR 2017, fig. 2).
-    width: channels of the first pair of convolutions; the second has twice, the third four times as many, and each of
-    these two begins with stride 2."""
+    width: channels of the first pair of convolutions; of the second twice, the third four times that, by stride 2."""
     return (width, 1), (width, 1), (2 * width, 2), (2 * width, 1), (4 * width, 2), (4 * width, 1)
 
 
@@ -108,8 +106,7 @@ class L2Net(HardNet):
 
 class GeoDesc(HardNet):
     """GeoDesc (Luo et al., ECCV 2018): L2-Net's layout without a batch norm after the last convolution.
-    Each patch is standardised by itself, as in the authors' training code (lzx551402/tfmatch, cnn_wrapper/descnet.py);
-    there is no dropout."""
+    Each patch is standardised, as in the authors' code (lzx551402/tfmatch, cnn_wrapper/descnet.py); no dropout."""
 
     def __init__(self) -> None:
         super().__init__(dropout=0.0)
@@ -156,8 +153,7 @@ class AffNetFast(AffNet):
 
 class OriNet(_FrameNetwork):
     """OriNet (Mishkin, Radenovic, Matas, ECCV 2018): a vector (y, x) in (-1, 1)^2 whose atan2 is the orientation.
-    The angle is atan2(first, second) in kornia's convention. The state_dict is that of the authors' release and of
-    kornia.feature.OriNet."""
+    The angle is in kornia's convention. The state_dict is that of the authors' release and of kornia.feature.OriNet."""
 
     outputs, eps = 2, 1e-8
     padding = 1  # nine positions, whose tanh is averaged

@@ -24,8 +24,7 @@ class SIFT:
     max_features: the strongest that are kept; a location with several orientations counts once for each.
     contrast_threshold, edge_threshold, sigma: as OpenCV's, see ``conf/features/sift.yaml``.
     precise_upscale: double the image so that pixel x lands on 2x, without the quarter-pixel shift of plain resizing.
-    max_pixels: a larger image is reduced to so many pixels first, which bounds memory: OpenCV needs about 240 bytes a
-    pixel of the image that it sees.
+    max_pixels: a larger image is reduced to so many pixels first, as OpenCV needs about 240 bytes a pixel.
     root: RootSIFT, the square root of the L1-normalised descriptor (Arandjelovic and Zisserman, CVPR 2012)."""
 
     max_features: Annotated[int, Within(1)] = 8000

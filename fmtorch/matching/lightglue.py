@@ -7,15 +7,19 @@ from torch import Tensor, nn
 from fmtorch.core.onnx_network import pretrained
 from fmtorch.core.types import Correspondences, Features
 
-FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
+FEATURES = (
+    "aliked",
+    "disk",
+    "xfeat",
+)  # those that need no more than positions and descriptors, and that this project reads
 
 
 class LightGlue:
     """Matches the features of two images by a transformer; the slots of the result are the matches found.
     score and prior: the network's score, its P(match). Frames are not handed on: the features that it is for have none.
-    features: `aliked` or `disk`, what the weights were trained for; threshold: least score. device: auto, cpu, cuda.
-    network: in place of the released one. For any number of threads. Raises ConnectionError where the weights cannot be
-    fetched."""
+    features: `aliked`, `disk` or `xfeat` (LighterGlue), what the weights were trained for; threshold: least score.
+    device: auto, cpu, cuda. network: in place of the released one. For any number of threads. Raises ConnectionError
+    where the weights cannot be fetched."""
 
     def __init__(
         self, features: str = "aliked", threshold: float = 0.1, device: str = "auto", network: nn.Module | None = None
@@ -27,9 +31,13 @@ class LightGlue:
         kind = kornia.feature.LightGlue
         # The file that kornia's loader looks for in torch's folder of checkpoints: it replaces every dot of the name
         kept_as = f"{kind.features[features]['weights']}_{kind.version}.pth".replace(".", "-")
+        publisher, file = "github.com/cvg/LightGlue", f"{features}_lightglue.pth"
+        if features == "xfeat":
+            publisher, file = "github.com/verlab/accelerated_features", "xfeat-lighterglue.pt"
+            kept_as = file
         network = network or pretrained(
             lambda: kind(features, filter_threshold=threshold), f"LightGlue ({features})",
-            "github.com/cvg/LightGlue or huggingface.co/kornia", f"{features}_lightglue.pth", kept_as,
+            f"{publisher} or huggingface.co/kornia", file, kept_as,
         )  # fmt: skip
         self.network = network.eval().to(self.device)
         self._length = int(kind.features[features]["input_dim"])

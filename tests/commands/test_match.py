@@ -24,12 +24,13 @@ from fmtorch.commands.match import pose_line
 from fmtorch.core import WARNINGS, conf_dir
 from fmtorch.data import ImageError, ImagePair, Lens, load, read_image, undistorted_points
 from fmtorch.geometry import homography_points, sampson
-from fmtorch.metrics import nsgd, pose_error
+from fmtorch.metrics import nsgd
 from fmtorch.pipeline import PhotographCameras, load_pipeline
 from tests.conftest import shared_path
 from tests.data.test_images import with_exif
-from tests.helpers import ROWS
+from tests.helpers import ROWS, write_file
 from tests.matching import stand_in
+from tests.reference.known_cameras import pose_error
 
 BANDS = (30, 5, 42, 18, 36, 11)  # disparities of bands of the picture, from the top, in 1/640 of its width
 SIDE = 768  # px, to which photographs are reduced for matching
@@ -171,7 +172,7 @@ def test_every_pipeline_composes_by_name(name: str, tmp_path: Path, monkeypatch:
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
     built = load_pipeline(name)
-    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue", "given_fmtorch")
+    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue", "xfeat_lighterglue", "given_fmtorch")
 
 
 def test_overrides_and_a_callers_own_hydra() -> None:
@@ -248,8 +249,7 @@ def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch:
     settings = {"pipeline": "sift_gms", "seed": 0, "cameras": None}
     output, folder = match_command._default_output, Path("matches/a-b")
     assert output(paths, settings) == folder
-    folder.mkdir(parents=True)
-    (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg", **settings}))
+    write_file(folder / "result.json", json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg", **settings}))
     assert output(paths, settings) == output([path.absolute() for path in paths], settings) == folder
     changes = ({"seed": 1}, {"pipeline": "sift_lpm"}, {"cameras": "unknown"})
     calls = [(others, settings), *((paths, settings | changed) for changed in changes)]
@@ -273,9 +273,7 @@ def matched(pair: ImagePair, pipeline: fmtorch.Pipeline, **cameras: object) -> f
 
 
 def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
-    """The larger angle of the pose error, with the sign of t, in degrees."""
-    R, t = (torch.from_numpy(np.array(value)) for value in (pair.R, pair.t))
-    return float(pose_error(result.R.double(), result.t.double(), R, t, up_to_sign=False).worst)
+    return pose_error(result.R.double().numpy(), result.t.double().numpy(), pair)  # type: ignore[arg-type]
 
 
 def test_the_pose_of_reduced_photographs_by_what_is_known(pair, pipeline_with_cameras):

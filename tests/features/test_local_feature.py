@@ -19,8 +19,6 @@ from tests.helpers import same
 from tests.processes import run_command
 from tests.reference import local_features as reference
 
-WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")
-
 
 def random_network(seed: int, outputs: int) -> torch.nn.Module:
     torch.manual_seed(seed)
@@ -29,7 +27,7 @@ def random_network(seed: int, outputs: int) -> torch.nn.Module:
     ).requires_grad_(False)
 
 
-@pytest.mark.parametrize("name", WITHOUT_NETWORK)
+@pytest.mark.parametrize("name", ["rootsift", "dspsift", "rootsiftpca"])
 def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
     image = texture(0)
     found = presets.build("features", name)(image)
@@ -97,8 +95,7 @@ def test_large_images_are_reduced_for_opencv() -> None:
     assert torch.equal(features.SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)
 
 
-DOWNLOADED = ("aliked", "disk")  # their weights are not in models/; see test_kornia_features.py
-NAMES = [name for name in presets.available("features") if name not in (*DOWNLOADED, "none")]
+NAMES = [n for n in presets.available("features") if n not in ("aliked", "disk", "xfeat", "none")]  # in models/
 every = pytest.mark.parametrize("name", NAMES)
 SHAPES = [(1, 1), (1, 300), (300, 1), (20, 31), (60, 80, 3)]
 
@@ -150,9 +147,7 @@ GROWTH = """
 import sys, time
 import cv2, numpy as np, torch
 from fmtorch import presets
-
-def peak():  # not ru_maxrss, which a process inherits from the one that started it
-    return 1024 * int(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+from tests.processes import peak_memory
 
 torch.set_num_threads(1)
 name, options = sys.argv[1], {"max_features": 500}
@@ -160,14 +155,14 @@ extract = presets.build("features", name, **options)
 noise = np.random.default_rng(0).integers(0, 256, (512, 512)).astype(np.uint8)
 extract(noise)  # what is read and made on first use is not counted
 image = cv2.resize(noise, (8192, 8192), interpolation=cv2.INTER_CUBIC)
-before = peak()
+before = peak_memory()
 found = extract(image)
 assert len(found) == 500, len(found)
 assert found.image_size.tolist() == [8192, 8192]
 assert bool(torch.isfinite(found.lafs).all())
 x = found.lafs[:, :, 2]
 assert float(x.max()) > 6000  # keypoints all over the image, in its own pixels
-print(peak() - before)
+print(peak_memory() - before)
 """
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from fmtorch import presets
 from fmtorch.core import NetworkFileError, models_dir
-from fmtorch.features import ALIKED, DISK, PatchNetwork
+from fmtorch.features import ALIKED, DISK, PatchNetwork, XFeat
 from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, build, load_weights
 from scripts.patch_networks.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
@@ -215,17 +215,19 @@ def test_files_tell_nothing_of_where_they_were_made(hardnet: Path) -> None:
         assert not [word for word in (b'.py", line ', b"/home/", b"/root/") if word in content], file
 
 
-def untrained(name: str) -> DISK | ALIKED:
+def untrained(name: str) -> DISK | ALIKED | XFeat:
     torch.manual_seed(0)
     if name == "disk":
         return DISK(max_features=50, score_threshold=-100.0, device="cpu", network=kornia.feature.DISK())
+    if name == "xfeat":
+        return XFeat(max_features=50, device="cpu", network=kornia.feature.XFeat(detection_threshold=0.0))
     return ALIKED(max_features=50, device="cpu", network=kornia.feature.ALIKED(detection_threshold=0.0))
 
 
-both = pytest.mark.parametrize("name", ["disk", "aliked"])
+each = pytest.mark.parametrize("name", ["disk", "aliked", "xfeat"])
 
 
-@both
+@each
 @pytest.mark.parametrize("colour", [False, True])
 def test_shapes_and_ranges(name: str, colour: bool) -> None:
     image, extractor = texture(0, *SIZE), untrained(name)
@@ -234,7 +236,7 @@ def test_shapes_and_ranges(name: str, colour: bool) -> None:
         assert same(found, extractor(np.stack([image] * 3, -1)))
     assert 10 < len(found) <= 50
     assert found.image_size.tolist() == list(SIZE)
-    assert found.descriptors.shape == (len(found), 128)
+    assert found.descriptors.shape == (len(found), 64 if name == "xfeat" else 128)
     torch.testing.assert_close(found.descriptors.norm(dim=1), torch.ones(len(found)))
     assert found.scores.shape == (len(found),)
     assert (found.keypoints >= 0).all()
@@ -287,18 +289,34 @@ def test_aliked_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: 
     assert few.scores.min() > 0.7
 
 
-@both
+def test_xfeat_keypoints_count_from_the_centre_of_the_first_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an image that is resized from (120, 152) to (96, 128): a ramp tells where pixels come from."""
+    network, ramps, at = kornia.feature.XFeat().eval(), [], torch.tensor([[40, 30], [100, 70]])
+
+    def detected(image: Tensor, top_k: int) -> list[dict[str, Tensor]]:
+        resized, high, wide = network._preprocess_tensor(image)
+        ramps.append(resized[0, :2, at[:, 1], at[:, 0]].T * 255)
+        return [{"keypoints": at * torch.tensor([wide, high]), "scores": torch.ones(2), "descriptors": ramps[0]}]
+
+    monkeypatch.setattr(network, "detectAndCompute", detected)
+    y, x = np.mgrid[:120, :152].astype(np.uint8)
+    found = XFeat(network=network, device="cpu")(np.stack([x, y, x], -1))
+    torch.testing.assert_close(found.keypoints, ramps[0], rtol=0, atol=1e-3)
+
+
+@each
 @pytest.mark.parametrize("shape", [(31, 200), (0, 0), (1, 500, 3), (64, 64, 4)])
 def test_images_that_cannot_be(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="at least 32 x 32"):
         untrained(name)(np.zeros(shape, np.uint8))
 
 
-@both
+@each
 def test_weights_that_cannot_be_fetched(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cls, file, publisher = {
         "disk": (kornia.feature.DISK, "depth-save.pth", "github.com/cvlab-epfl/disk"),
         "aliked": (kornia.feature.ALIKED, "aliked-n16.pth", "github.com/Shiaoming/ALIKED"),
+        "xfeat": (kornia.feature.XFeat, "xfeat.pt", "github.com/verlab/accelerated_features"),
     }[name]
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
 
