@@ -1,5 +1,6 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
+import contextlib
 import functools
 import pdb
 import re
@@ -7,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra._internal.hydra import Hydra
@@ -18,7 +20,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
@@ -32,7 +34,6 @@ Task = Callable[[DictConfig], None]
 SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
 OVERRIDE = re.compile(r"(?P<key>(?:\+\+|\+)?[A-Za-z_][\w./@:-]*)=(?P<value>.*)", re.DOTALL)
 LITERAL = re.compile(r"null|true|false|\?\?\?|'.*'|\".*\"", re.IGNORECASE | re.DOTALL)  # what a path field may hold
-
 
 for each in COMMANDS.values():
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
@@ -84,7 +85,7 @@ def run_command(command: Command, task: Task) -> None:
         paths = [*composition.path_fields(command.options), *command.texts]
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
         for name, _, value in (word.partition("=") for word in sys.argv):
-            if value.startswith("[") and isinstance(preset := command.groups.get(name), str):
+            if (value == "null" or value.startswith("[")) and isinstance(preset := command.groups.get(name), str):
                 raise ValueError(f"{name}={value}; it must be one preset, such as {preset}")
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)
@@ -121,10 +122,11 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     if isinstance(cause, GrammarParseError):
         return f"{cause.full_key}: {_line(str(cause.msg))}"
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
-        names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
+        values: Any = OmegaConf.to_container(parent) if isinstance(parent, DictConfig) else {}
+        names = list(map(str, values))
         if parent is not None and cause.key is not None and str(cause.key) not in names:
-            names = [name for name in names if not name.startswith(("hydra", "_"))]
-            names = names if "." in cause.full_key else options
+            names += [f"{name}.{cause.key}" for name, v in values.items() if isinstance(v, dict) and cause.key in v]
+            names = [n for n in names if not n.startswith(("hydra", "_"))] if "." in cause.full_key else options
             return f"no option {cause.full_key}; there are: {nearest(str(cause.key), names) or 'none'}"
         return f"{cause.full_key}: {_line(str(cause.msg or cause))}"
     unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
@@ -215,18 +217,15 @@ def _quoted(word: str, paths: Sequence[str], multirun: bool) -> str:
 
 
 def _exists(value: str) -> bool:
-    try:
+    with contextlib.suppress(OSError):  # too long for a name
         return bool(value) and Path(value).exists()
-    except OSError:  # too long for a name
-        return False
+    return False
 
 
 def _parses(word: str) -> bool:
-    try:
-        OverridesParser.create().parse_override(word)
-    except HydraException:
-        return False
-    return True
+    with contextlib.suppress(HydraException):
+        return bool(OverridesParser.create().parse_override(word))
+    return False
 
 
 def _text(value: str) -> str:

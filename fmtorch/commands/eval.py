@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import os
 import sys
 import tempfile
@@ -9,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from omegaconf import DictConfig
 
 from fmtorch import data, presets
@@ -29,7 +31,7 @@ from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
 from fmtorch.two_view.arguments import expect_lens, expect_lenses
 
-SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders
+SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders and pairs
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -86,11 +88,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     for reason, trace in pipeline.tracebacks.items():
         errors.print(f"{reason}\n{trace}".strip(), soft_wrap=True)
     if pairs and summary[ALL]["failures"] == len(pairs):
-        reason = next(iter(table["reason"].to_pylist()))
         again = f"once that is mended, delete {folder.path} to run again"
         if folder.config.get("code"):
             again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
-        raise ValueError(f"every pair failed, the first because: {reason}; {again}")
+        raise ValueError(f"every pair failed, the first because: {table['reason'][0]}; {again}")
     return folder.path
 
 
@@ -141,12 +142,11 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
     for each in tables.terminal_tables(summary, f"{title}{part}", console.width):
         console.print(each)
-    about = f"; of all {len(run_table)} pairs" if part else ""
-    written = f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}"
-    console.print(written, style="dim", soft_wrap=True)
+    about = f"summary.md, recall.svg{f'; of all {len(run_table)} pairs' if part else ''}"
+    console.print(f"{folder.path}: pairs/, summary.json, {about}", style="dim", soft_wrap=True)
     if file := os.environ.get(SWEPT):
-        with open(file, "a", encoding="utf-8") as swept:
-            swept.write(f"{folder.path.absolute()}\n")
+        with open(file, "ab", buffering=0) as swept:  # a line in one piece, beside those of other processes
+            swept.write(f"{json.dumps([str(folder.path.absolute()), table['key'].to_pylist()])}\n".encode())
     return summary
 
 
@@ -178,9 +178,12 @@ def main() -> None:
             _print_sweep(swept.read().splitlines())
 
 
-def _print_sweep(folders: Sequence[str]) -> None:
-    paths = list(dict.fromkeys(folders))
+def _print_sweep(lines: Sequence[str]) -> None:
+    """lines: of each job its run folder and the keys of its pairs, to which the table keeps."""
+    jobs = [json.loads(line) for line in lines]
+    paths, keys = dict.fromkeys(path for path, _ in jobs), pa.array([key for _, own in jobs for key in own], pa.int64())
     runs = named([RunFolder.load(path) for path in paths]) if len(paths) > 1 else []
+    runs = [r._replace(table=r.table.filter(pc.is_in(r.table["key"], keys))) for r in runs]
     for heading, group in by_dataset(runs).items():
         figures = {r.name: summarize(r.table, r.folder.config.get("pose") is not None)[ALL] for r in group}
         for table in tables.terminal_tables(figures, f"{len(group)} runs on {heading}", console.width):

@@ -17,8 +17,7 @@ HEADINGS = {"paper": "as in FM-Bench's paper"}  # of the folders within groups
 
 
 def listed(group: str) -> list[str]:
-    """A line for each preset of a group: name, and the first sentence of its file; then, under headings, its folders'.
-    Raises ValueError for no group."""
+    """A line for each preset, name and first sentence; its folders' under headings. Raises ValueError for no group."""
     if group not in groups():
         raise ValueError(f"no group {group!r}; there are: {nearest(group, groups())}")
     names = available(group)

@@ -2,8 +2,11 @@
 
 Help, and a mistake in the command's name, are answered here, before any library is imported."""
 
+import dataclasses
 import os
+import re
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -79,8 +82,6 @@ def _command(name: str) -> Callable[[], None]:
 
 def help_text(command: "Command") -> str:
     """The page of a command: what it does, its groups of presets and its options, each with its default."""
-    import dataclasses
-
     places = "".join(f" [{name.removesuffix('...').upper()}]" for name in command.positional)
     summary = SUMMARIES[command.name]
     about = f"{summary[0].upper()}{summary[1:]}.\n{command.about}"
@@ -102,8 +103,6 @@ def help_text(command: "Command") -> str:
 
 def _replaced(pipeline: str) -> dict[str, str]:
     """The presets that a pipeline's file puts in place of those of each stage; of no name nothing."""
-    import re
-
     from fmtorch.core.files import conf_dir
 
     if not pipeline:
@@ -114,8 +113,6 @@ def _replaced(pipeline: str) -> dict[str, str]:
 
 def _line(name: str, value: Any, about: str) -> str:
     """A name with its default and what is said of it; of an option with parts, their names."""
-    import textwrap
-
     from fmtorch.core.options import shown
 
     if isinstance(value, dict):

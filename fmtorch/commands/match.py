@@ -59,7 +59,9 @@ def match_folder(
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
-    journal = match_store.MatchStore(folders.open_folder(output, identity), folder)
+    remedy = "choose another output, or delete the folder"
+    files.claim(output / folders.RECORD, identity, "matches", remedy, alone=False)
+    journal = match_store.MatchStore(output / "export", folder)
     scratch = journal.folder / "features"
     if len(images) > folders.MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)
@@ -86,10 +88,9 @@ def match_folder(
     _say(work, graph, len(pairs))
     console.print(f"{output}: {', '.join(written)}", style="dim")
     exported = images if "colmap" in kinds and fields.orient else ()
-    if turned := [image.relative_to(folder).as_posix() for image in exported if stored_orientation(image) != 1]:
-        said = files.head(turned)
+    if turned := files.head([f.relative_to(folder).as_posix() for f in exported if stored_orientation(f) != 1]):
         console.print(
-            f"turned by their orientation tags: {said}. Keypoints and cameras in database.db are those of the turned "
+            f"turned by their orientation tags: {turned}. Keypoints and cameras in database.db are those of the turned "
             "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
             "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
         )
@@ -102,7 +103,7 @@ def _expect_some(work: FolderMatches, pairs: int) -> None:
     for trouble in work.troubles:
         errors.print(trouble, style="bold", soft_wrap=True)
     if work.taken:
-        console.print(f"{work.taken} of {pairs} pair{'s' * (pairs != 1)} taken from an earlier run")
+        console.print(f"{work.taken} of {files.counted(pairs, 'pair')} taken from an earlier run")
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
 
@@ -118,10 +119,9 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
 
 def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Path) -> str:
     def read(name: str) -> NDArray[np.uint8] | None:
-        try:
+        with contextlib.suppress(OSError, ValueError):
             return read_image(folder / name, orient=orient)
-        except (OSError, ValueError):
-            return None
+        return None
 
     files.write_whole(output / "graph.svg", view_graph_svg(graph, read))
     return "graph.svg"
@@ -203,10 +203,9 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
-    """The 3 x 3 matrix of a text file of nine numbers, row by row, apart by spaces, commas or new lines.
-    Raises ValueError for a file of anything else."""
-    words = path.read_text().replace(",", " ").split()
+    """The 3 x 3 matrix of a text file of nine numbers, row by row. Raises ValueError for a file of anything else."""
     try:
+        words = path.read_text().replace(",", " ").split()
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
         raise ValueError(f"{path}: {error}; it must hold nine numbers, F row by row") from error

@@ -15,6 +15,7 @@ from rich.progress import Progress
 from fmtorch import data, presets
 from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import PAIRS, PairsOptions
+from fmtorch.core.files import counted
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.pairs import HeldPairs
@@ -115,7 +116,7 @@ def _each(
 
 def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
-    console.print(f"{summary['kept']} pair{'s' * (summary['kept'] != 1)} of {summary['images']} images; {judged}")
+    console.print(f"{counted(summary['kept'], 'pair')} of {summary['images']} images; {judged}")
     if construction.count is not None and summary["kept"] < construction.count:
         console.print(f"no more pass the rule than these; {construction.count} were asked for")
     if problems:

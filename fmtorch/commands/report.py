@@ -54,8 +54,8 @@ def run(config: DictConfig) -> Path:
             terminal.console.print(f"{section.heading}: {note}")
     if fields.output is None and not (ignoring := output.with_name(".gitignore")).exists():
         files.write_whole(ignoring, f"{output.name}\n{ignoring.name}\n")
-    size, plural = output.stat().st_size / 2**20, "s" * (len(runs) != 1)
-    terminal.console.print(f"{output}: {len(runs)} run{plural}, {size:.1f} MB", style="dim")
+    size = output.stat().st_size / 2**20
+    terminal.console.print(f"{output}: {files.counted(len(runs), 'run')}, {size:.1f} MB", style="dim")
     return output
 
 

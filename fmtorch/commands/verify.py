@@ -6,7 +6,7 @@ import sys
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.table import Table
+from rich.table import Column, Table
 
 from fmtorch import presets
 from fmtorch.commands.config import job, run_command
@@ -42,21 +42,19 @@ def run(config: DictConfig, estimator: str) -> Verification:
         said = f"{result.path} has a geometry of each pair ({result.pairs:,}); force=true replaces them"
         console.print(f"nothing to do: {said}", soft_wrap=True)
     console.print(_table(result))
-    console.print(str(result.path), style="dim")
     if result.pairs and len(result.problems) == result.pairs:
         sys.exit("error: no pair has a geometry")
+    console.print(str(result.path), style="dim")
     return result
 
 
 def _table(result: Verification) -> Table:
-    table = Table()
-    table.add_column("pairs")
-    table.add_column("", justify="right")
+    table = Table("pairs", Column(justify="right"))
     kinds = sorted(result.configurations.items(), key=lambda entry: -entry[1])
     rows: list[tuple[str, int]] = [("with matches", result.pairs)]
     rows += [("had a geometry", result.kept)] * bool(result.kept)
     rows += [("verified", result.verified), *((f"  {kind.replace('_', ' ')}", count) for kind, count in kinds)]
-    rows += [("could not be read", len(result.problems))] * bool(result.problems)
+    rows += [("failed", len(result.problems))] * bool(result.problems)
     for name, count in rows:
         table.add_row(name, f"{count:,}")
     table.add_row("seconds", f"{result.seconds:.1f}")

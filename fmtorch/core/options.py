@@ -23,8 +23,7 @@ T = TypeVar("T")
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
 MAX_NAMES = 12  # that a message lists
 UNIONS = (typing.Union, types.UnionType)
-UNRESOLVED = (NameError, AttributeError, TypeError, SyntaxError)
-"""What an annotation raises that means something to type checkers alone: it names what is imported for these only."""
+UNRESOLVED = (NameError, AttributeError, TypeError, SyntaxError)  # of annotations for type checkers alone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +97,7 @@ def expect_options(
             if key not in known:
                 raise ValueError(f"{where}: no option {key}; there are: {nearest(str(key), named) or 'none'}")
     missing = [n for n in named if known[n].default is inspect.Parameter.empty and n not in {*values, *given}]
+    missing += [str(name) for name, value in values.items() if isinstance(value, str) and value == "???"]
     if missing:
         raise ValueError(f"{where}: {', '.join(missing)} is missing")
     annotations = resolved(target)
@@ -147,11 +147,16 @@ def fits(value: Any, annotation: Any) -> bool:
 
 
 def _fit(values: Sequence[Any], kind: type, args: tuple[Any, ...]) -> bool:
-    if not (issubclass(list, kind) or issubclass(kind, tuple | set | frozenset)):
+    if not _holds_a_list(kind):
         return False
     if issubclass(kind, tuple) and args and args[-1] is not Ellipsis:
         return len(values) == len(args) and all(map(fits, values, args))
     return not args or all(fits(value, args[0]) for value in values)
+
+
+def _holds_a_list(kind: Any) -> bool:  # no protocol with attributes, of which issubclass cannot be asked
+    protocol = getattr(kind, "_is_protocol", False)
+    return (not protocol and issubclass(list, kind)) or issubclass(kind, list | tuple | set | frozenset)
 
 
 def expected(annotation: Any) -> str:
@@ -176,7 +181,7 @@ def expected(annotation: Any) -> str:
         return "a mapping"
     if args and issubclass(kind, tuple) and args[-1] is not Ellipsis:
         return f"a list of {', '.join(map(expected, args))}"
-    if issubclass(list, kind) or issubclass(kind, list | tuple):
+    if _holds_a_list(kind):
         return "a list" + (f", each {expected(args[0])}" if args else "")
     if dataclasses.is_dataclass(kind):
         return f"a mapping of: {', '.join(field.name for field in dataclasses.fields(kind))}"

@@ -5,9 +5,9 @@ Beside them the grey images that pruners look at, and the extractor of matchers 
 import contextlib
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -143,9 +143,15 @@ def called(wanted: str, part: Any, *given: Any) -> Any:
 @contextlib.contextmanager
 def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
     """Around a call of a part, which may be anybody's code. wanted: the parameters that a part of this kind takes.
-    Raises WrongPart naming the place of one that takes others, RuntimeError for one that ends the program."""
+    Raises WrongPart naming the place of one that takes others, that cannot be called, or that changes what it is given,
+    RuntimeError for one that ends the program."""
+    if not callable(part):
+        raise WrongPart(f"{name_of(part)} cannot be called; it must have __call__({wanted})")
+    before = _state(given)
     try:
         yield
+        if _state(given) != before:
+            raise WrongPart(f"{name_of(part)} changes what it is given, which others use: it must change a copy")
     except SystemExit as error:
         raise RuntimeError(f"{name_of(part)} ended the program: sys.exit({error.code!r})") from error
     except TypeError as error:
@@ -161,6 +167,12 @@ def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
         raise
 
 
+def _state(given: Sequence[Any]) -> list[float]:
+    """What tells whether matches, or the pixels of an image, were changed in place."""
+    fields = [t for c in given if isinstance(c, Correspondences) for t in (c.x0, c.x1, c.mask) if not t.is_inference()]
+    return [t._version for t in fields] + [float(image.sum()) for image in given if isinstance(image, np.ndarray)]
+
+
 def name_of(part: object) -> str:
     """The module and the name of a part's class, or of a function."""
     named = part if isinstance(part, type) or hasattr(part, "__qualname__") else type(part)
@@ -172,9 +184,8 @@ def output_of(
 ) -> Output:
     """What a stage returned, which may be anybody's code: a value of this kind.
     given: the matches that it was given, whose pairs and device are those of the result. like: a tensor on the device
-    that the result must be on, where no matches were given. Raises TypeError for something else, and ValueError for
-    another number of pairs or matches, another device, half precision, or pairs that are not those given. The message
-    begins with the part's name."""
+    that the result must be on, where no matches were given. Raises TypeError for something else, ValueError for other
+    pairs, another number of them or of matches, another device, and half precision, naming the part."""
     name = name_of(part)
     if not isinstance(value, kind):
         what = "None" if value is None else f"a {type(value).__name__}"
@@ -194,9 +205,26 @@ def output_of(
         raise ValueError(f"{name} returned {kind.__name__} of {len(value)} pairs; they must be of {pairs}")
     if given is None:
         return value
-    if isinstance(value, Estimate) and value.inliers.shape != given.mask.shape:
-        shape, wanted = tuple(value.inliers.shape), tuple(given.mask.shape)
-        raise ValueError(f"{name} returned inliers of shape {shape}; it must be that of the mask, {wanted}")
+    what, slots = ("inliers", value.inliers) if isinstance(value, Estimate) else ("matches", cast(Any, value).mask)
+    if slots.shape != given.mask.shape:
+        shape, wanted = tuple(slots.shape), tuple(given.mask.shape)
+        raise ValueError(f"{name} returned {what} of shape {shape}; it must be that of the mask, {wanted}")
     if isinstance(value, Correspondences) and not torch.equal(value.keys, given.keys):
         raise ValueError(f"{name} returned matches without their pairs' keys; use c.keep(mask) or c.replace(prior=...)")
-    return value
+    return sound(value, name) if isinstance(value, Estimate) else value
+
+
+def sound(estimate: Estimate, name: str) -> Estimate:
+    """The estimate of a part: pairs without a matrix are not ok, and those that are not ok alone have a reason."""
+    valid = torch.isfinite(estimate.matrix).flatten(1).all(1) & (estimate.matrix != 0).flatten(1).any(1)
+    ok, claimed = (estimate.ok & valid).tolist(), estimate.ok.tolist()
+    if ok == claimed and all(bool(reason) != fine for reason, fine in zip(estimate.reason, ok, strict=True)):
+        return estimate
+    wrong = "estimation: F is zero or not finite, though the estimator calls it ok"
+    reasons = [
+        "" if fine else wrong if was else reason or f"{name} gives no reason"
+        for fine, was, reason in zip(ok, claimed, estimate.reason, strict=True)
+    ]
+    F, inliers = torch.where(valid[:, None, None], estimate.matrix, 0), estimate.inliers & valid[:, None]
+    fields = {"matrix": F, "inliers": inliers, "ok": estimate.ok & valid, "reason": tuple(reasons)}
+    return estimate.replace(**fields, significance=None)

@@ -4,6 +4,7 @@ import contextlib
 import math
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -85,11 +86,13 @@ def error_line(error: BaseException) -> str:
 @contextlib.contextmanager
 def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
     """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback.
-    Interrupted, with status 130 and a line: `interrupted`, and what the KeyboardInterrupt says was kept."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        print(f"{interrupted}; {stop}" if str(stop) else interrupted, file=sys.stderr)
-        sys.exit(130)
-    except MISTAKES as error:
-        sys.exit(f"error: {error_line(error)}")
+    Interrupted, with status 130 and a line: `interrupted`, and what was kept. Warnings within are a line each."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: errors.print(f"warning: {message}", soft_wrap=True)
+        try:
+            yield
+        except KeyboardInterrupt as stop:
+            print(f"{interrupted}; {stop}" if str(stop) else interrupted, file=sys.stderr)
+            sys.exit(130)
+        except MISTAKES as error:
+            sys.exit(f"error: {error_line(error)}")

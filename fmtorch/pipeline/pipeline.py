@@ -103,19 +103,6 @@ class Outcome:
         return self.estimate is not None and bool(self.estimate.ok[0])
 
 
-def expect_finite(estimate: Estimate) -> Estimate:
-    """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
-    valid = torch.isfinite(estimate.matrix).flatten(1).all(1) & (estimate.matrix != 0).flatten(1).any(1)
-    wrong = (estimate.ok & ~valid).tolist()
-    if not any(wrong):
-        return estimate
-    said = "estimation: F is zero or not finite, though the estimator calls it ok"
-    reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
-    keep = valid[:, None]
-    F, inliers = torch.where(keep[..., None], estimate.matrix, 0), estimate.inliers & keep
-    return estimate.replace(matrix=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
-
-
 def collated(outcomes: Sequence[Outcome]) -> Correspondences:
     """The matches of the outcomes that have some, as one batch."""
     return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
@@ -131,8 +118,7 @@ class Pipeline:
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features), and their
     grey levels where a pruner looks at them. families: by family, pruners that its pairs get in place of those of the
     same names. model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
-    debug: raise what a stage raises, which otherwise becomes the reason for its pair's failure. tracebacks: of stages
-    that are a user's own code and raised something, by what is said of it."""
+    debug: raise what a stage raises, else the reason for its pair's failure. tracebacks: of a user's stages."""
 
     def __init__(
         self, features: FeatureExtractor, matcher: Matcher, pruners: Mapping[str, Pruner], estimator: Estimator, *,
@@ -208,7 +194,7 @@ class Pipeline:
         """The estimate of a batch with its significance, and with its cameras where the matches ask for them."""
         used = KnownCameras(self.estimator) if c.asks_for_cameras else self.estimator
         estimate = stages.output_of(used, stages.called("c, seed=0", used, c, seed), Estimate, c)
-        return judged(expect_finite(estimate.detach()), c)
+        return judged(estimate.detach(), c)
 
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
         matched = [self._match(pair) for pair in pairs]
@@ -379,8 +365,7 @@ def load_pipeline(
         config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
 
     Raises:
-        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
-            `config_dir` is no folder.
+        ValueError: for an unknown pipeline, an override that does not apply, and a `config_dir` that is no folder.
     """
     if config_dir is not None and not Path(config_dir).is_dir():
         raise ValueError(f"config_dir={config_dir} is no folder")

@@ -47,12 +47,11 @@ class FileConfigSource(file_config_source.FileConfigSource):
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
 OF_PIPELINES = frozenset({FAMILIES, "soft"})  # options that pipelines' presets set, of pruners that may be replaced
 WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
-WIDE = (
+WIDE = (  # families of wide baselines; the others are taken for videos, whose baselines are short
     "Tanks_and_Temples", "CPC",  # of FM-Bench
     "Strecha", "Strecha_train", "PhotoTourism", "TanksLike",  # further photographs of unordered scenes
     "orbit", "collection",  # rendered
 )  # fmt: skip
-"""Families of wide baselines by name. The others are taken for videos, whose baselines are short."""
 
 
 def pruner_configs(config: DictConfig) -> dict[str, Any]:
@@ -153,8 +152,7 @@ ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "
 
 def stages(config: DictConfig) -> dict[str, Any]:
     """What a composed config says of each group of `STAGES`, as plain values.
-    Pruners are a list of mappings of one name each, in the order in which they run, which decides results and which no
-    mapping keeps on its way through JSON with sorted keys."""
+    Pruners are a list of mappings of one name each, in their order, which mappings lose in JSON of sorted keys."""
     plain = {group: OmegaConf.to_container(config[group], resolve=True) for group in STAGES if config.get(group)}
     return {**plain, "pruner": [{name: value} for name, value in pruner_configs(config).items()]}
 
@@ -189,8 +187,7 @@ def expect_stages(config: DictConfig) -> None:
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
-    """The config that a command composes from its arguments; a caller's own Hydra stays as it is.
-    config_dir: a folder with a user's presets, which are read anew."""
+    """A command's config; a caller's own Hydra stays as it is. config_dir: of a user's presets, which are read anew."""
     words = tuple(overrides)
     return _kept(config_name, words, None) if config_dir is None else _composed(config_name, words, config_dir)
 
@@ -213,14 +210,15 @@ Fields = TypeVar("Fields")
 
 def read_fields(fields: type[Fields], config: DictConfig, where: str = "") -> Fields:
     """The fields of a dataclass from a config that may hold more.
-    Raises ValueError naming the first that is wrong, as ``limit=-3; it must be a whole number of at least 1 or
-    null``."""
+    Raises ValueError for the first that is wrong: ``limit=-3; it must be a whole number of at least 1 or null``."""
     names = [field.name for field in dataclasses.fields(fields) if field.name in config]  # type: ignore[arg-type]
     values: dict[str, Any] = {
         name: OmegaConf.to_container(config[name], resolve=True) if OmegaConf.is_config(config[name]) else config[name]
         for name in names
     }
     paths = set(path_fields(fields))
+    if empty := [name for name in values if name in paths and values[name] == ""]:
+        raise ValueError(f"{empty[0]} is empty; give a path, or leave it out")
     values = {name: str(v) if name in paths and type(v) in (int, float) else v for name, v in values.items()}
     expect_options(fields, values, where)
     return _built(fields, values)
@@ -297,8 +295,7 @@ def resolve_device(name: str) -> torch.device:
 
 
 def open_files(part: Any, device: torch.device) -> None:
-    """Have this project's parts read their learned files now, at any depth, where they have an `open_file`.
-    Raises ValueError, naming the file, where one cannot be used."""
+    """Have parts at any depth read their learned files, by `open_file`. Raises ValueError, naming an unusable file."""
     if hasattr(part, "open_file"):
         part.open_file(device)
     elif isinstance(part, Mapping | list | tuple):

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -30,18 +31,13 @@ def groups() -> list[str]:
 
 def summary(path: Path) -> str:
     """The first sentence of the comment at the top of a preset file."""
-    lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            break
-        if not line.startswith("# @package"):
-            lines.append(line.removeprefix("#").strip())
-    return re.split(r"(?<!al)\.(?=\s|$)", " ".join(lines))[0]
+    comment = itertools.takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
+    text = " ".join(line.removeprefix("#").strip() for line in comment if not line.startswith("# @package"))
+    return re.split(r"(?<!al)\.(?=\s|$)", text)[0]
 
 
 def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[str, Any]:
-    """The contents of one preset file; files in `config_dir` come before the project's own.
-    Raises ValueError with the available names where there is no such preset."""
+    """A preset's contents, of `config_dir` before the project's own. Raises ValueError with the names there are."""
     folders = [Path(config_dir)] if config_dir is not None else []
     for folder in [*folders, conf_dir()]:
         path = folder / group / f"{name}.yaml"
@@ -157,15 +153,17 @@ def merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, A
 
 def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
     """The object of a config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
-    A value that is a mapping with a `_target_` of its own becomes an object first. Raises ValueError where
-    `expect_buildable` does; what the target itself raises passes through."""
+    Mappings with a `_target_` become objects first. Raises as `expect_buildable`, and what the target raises."""
     return construct(target_of(config, where), config, where, **extra)
 
 
 def construct(make: Callable[..., T], config: Mapping[str, Any], where: str, **extra: Any) -> T:
     """The same with the target given: of the entries of a config but for its `_target_`."""
     expect_buildable(config, where, extra, make)
-    return _constructed(make, config, where, extra)
+    part = _constructed(make, config, where, extra)
+    if part is None or isinstance(part, bool | int | float | str):
+        raise ValueError(f"{where}: {config.get('_target_')} returned {part!r}, which is no part")
+    return part
 
 
 def expect_buildable(
@@ -206,20 +204,31 @@ def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
         target: Callable[..., Any] = _located(name)
     except (Exception, SystemExit) as error:  # what a module of a user's raises while it is imported
         raise ValueError(f"{where}: _target_={name} cannot be imported: {' '.join(str(error).split())}") from error
+    if not callable(target):
+        raise ValueError(f"{where}: _target_={name} is a {type(target).__name__}; it must name a class or a function")
     return target
 
 
 def _located(name: str) -> Any:
-    parts = name.split(".")
-    value: Any = importlib.import_module(parts[0])
-    for i, part in enumerate(parts[1:], start=2):
-        try:
-            value = getattr(value, part)
-        except AttributeError:
-            if not isinstance(value, ModuleType):
-                raise
-            value = importlib.import_module(".".join(parts[:i]))
+    first, *parts = name.split(".")
+    value: Any = importlib.import_module(first)
+    for part in parts:
+        if isinstance(value, ModuleType) and not hasattr(value, part):
+            _import_module(value, part)
+        value = getattr(value, part)
     return value
+
+
+def _import_module(parent: ModuleType, part: str) -> None:
+    name = f"{parent.__name__}.{part}"
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:  # what a module of this name needs
+            raise
+        own = vars(parent)
+        names = [n for n in dir(parent) if not (n.startswith("_") or isinstance(own.get(n), ModuleType))]
+        raise ImportError(f"module {parent.__name__} has no {part}; there are: {nearest(part, names)}") from error
 
 
 def peer_packages(config: object) -> list[str]:

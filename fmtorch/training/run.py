@@ -32,6 +32,7 @@ from torch.utils.data import DataLoader
 
 from fmtorch import data, presets
 from fmtorch.core import expect_options, files, terminal
+from fmtorch.core.stages import WrongPart, name_of
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset, construction, read_image
 from fmtorch.data.pairs import PairSubset
@@ -86,6 +87,8 @@ class PrunerTraining(lightning.LightningModule):
     def training_step(self, batch: LabelledMatches, index: int) -> Tensor:
         """The loss of a batch. Raises FloatingPointError where it is not finite: no step is skipped in silence."""
         terms = self.objective(predict(self.network, batch.correspondences), batch, self.global_step)
+        if not terms["loss"].requires_grad:
+            raise WrongPart(f"{name_of(self.network)}: its log-odds carry no gradient to its parameters")
         if not bool(torch.isfinite(terms["loss"])):
             values = {name: float(value) for name, value in terms.items()}
             raise Diverged(f"the loss of step {self.global_step} is not finite: {values}")
@@ -194,8 +197,7 @@ class _ResumableCheckpoint(ModelCheckpoint):
 
 
 class _TrainingBar(Callback):
-    """The progress bar of a training, earlier attempts included: steps, loss, and the best figure of validation so far.
-    total: steps in all. monitor: the figure of validation that is shown."""
+    """The progress bar of a training, earlier attempts included: steps of `total`, loss, the best of `monitor`."""
 
     def __init__(self, total: int, monitor: str) -> None:
         self.total, self.monitor, self._figure = total, monitor, ""
@@ -225,8 +227,7 @@ class _TrainingBar(Callback):
 
 
 class ValidationPictures(Callback):
-    """Draws some validation pairs: matches with P(inlier) >= 0.5 green, the others thin and red.
-    pairs: the pairs and their matches, batches of one."""
+    """Draws some validation pairs, batches of one: matches with P(inlier) >= 0.5 green, the others thin and red."""
 
     def __init__(self, pairs: Sequence[tuple[ImagePair, LabelledMatches]]) -> None:
         self.pairs = list(pairs)
@@ -259,7 +260,7 @@ def classified(pair: ImagePair, matches: LabelledMatches, network: torch.nn.Modu
 
 
 FEW = 500  # pairs to train on, below which no useful network is to be expected
-MORE = "dataset.size=full renders 3,200 pairs, dataset=fmbench dataset.root=FOLDER are your own"
+MORE = "give more of your own, or dataset=rendered dataset.size=full, which renders 3,200"
 PICTURES = 4  # validation pairs that are drawn into the log
 
 
@@ -292,9 +293,11 @@ def run(config: DictConfig, name: str) -> Path:
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"pairs to train on: {len(matches.training)}, to validate on: {len(matches.validation)}"
-        terminal.console.print(f"{about}; {folder}", soft_wrap=True)
+        about += f" (validation.pairs={options.validation.pairs} of each family at most); {folder}"
+        terminal.console.print(about, soft_wrap=True)
         if len(matches.training) < FEW:
-            terminal.console.print(f"so few pairs show that it runs, and teach little; {MORE}", soft_wrap=True)
+            few = "so few pairs" if options.limit is None else f"so few pairs (limit={options.limit} of each family)"
+            terminal.console.print(f"{few} show that it runs, and teach little; {MORE}", soft_wrap=True)
     pictured = [(p, m) for p, m in matches.validation if p.image0.path.is_file() and p.image1.path.is_file()]
     shown = pictured[:: max(1, len(pictured) // PICTURES)][:PICTURES]
     batches = functools.partial(training_batches, matches.training, config.batch, config.seed, workers=config.loaders)
@@ -357,8 +360,7 @@ class Matches(NamedTuple):
 
 
 def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progress) -> Matches:
-    """The matches of the config's data set, split by scenes, and of its further validation sets.
-    Raises ValueError where there is nothing to train on or to validate on."""
+    """The matches of the config's data set, split by scenes, and of further validation sets. ValueError without any."""
     photographs, given, validated = list[Photograph](), config.photographs, options.validation
     if options.planes.photographs is not None:
         photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)

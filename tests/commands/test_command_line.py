@@ -4,6 +4,7 @@ import importlib
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,6 @@ from tests.helpers import draw, draw_set
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COUNT = "it must be a whole number of at least 1"
-NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
 SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
 
 
@@ -92,6 +92,8 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("eval estimator._target_=fmtorch.estimators.Magic", "estimator: _target_=fmtorch.estimators.Magic cannot be"),
         ("eval pipeline=sift_magic", "no preset 'sift_magic' in pipeline; there are: sift_"),
         ("eval estimator=[]", "estimator=[]; it must be one preset, such as ransac"),
+        ("eval features=null", "features=null; it must be one preset, such as sift"),
+        ("eval pruner.threshold=2", "no option pruner.threshold; there are: ratio.threshold, ratio"),
         ("eval pruner=[ratio,gmss]", "no preset 'gmss' in pruner; there are: gms"),
         ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),
         ("eval limitt=2", "no option limitt; there are: limit"),
@@ -102,6 +104,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
+        ("match a.png b.png output=", "output is empty; give a path, or leave it out"),
         ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
         ("match /dev/zero /dev/zero", "/dev/zero: no regular file; it must be an image file"),  # nor read for ever
         ("report nowhere", "nowhere holds no run"),
@@ -123,7 +126,7 @@ def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_p
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("names", NAMES)
+@pytest.mark.parametrize("names", [("a photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")])
 @pytest.mark.parametrize("form", ["image0={} image1={}", "{} {}"])
 def test_any_file_name_is_a_photograph(names, form, tmp_path, monkeypatch):
     """Both are read: the command ends at the second, which is no image, and names it."""
@@ -154,11 +157,14 @@ def test_flags_and_sweeps_stay_what_they_are() -> None:
     assert hydra_arguments(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
 
 
-def test_an_interrupted_command_says_what_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_command_says_what_is_kept_and_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with exits_with_message():
+        warnings.warn("nothing is cached", stacklevel=1)
     with pytest.raises(SystemExit) as end, exits_with_message("interrupted; the same command continues"):
         raise KeyboardInterrupt("3 of 8 pairs are kept in runs/a")
     assert end.value.code == 130
-    assert capsys.readouterr().err == "interrupted; the same command continues; 3 of 8 pairs are kept in runs/a\n"
+    lines = ["warning: nothing is cached", "interrupted; the same command continues; 3 of 8 pairs are kept in runs/a"]
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
@@ -173,7 +179,7 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
 
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
-    return draw_set(tmp_path / "Set", images=2).parent
+    return draw_set(tmp_path / "Set", images=3).parent
 
 
 def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(data_set, monkeypatch, capfd):
@@ -181,6 +187,8 @@ def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(data_set, monkeypatch
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
     assert (data_set / "out" / "summary.md").is_file()
     assert "Traceback" not in capfd.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["eval", *SMALL[:2]])  # two pairs, of which the sweep has one
+    importlib.import_module("fmtorch.commands.eval").main()
     pipelines = ["sift_ratio", "paper/sift_ratio"]
     monkeypatch.setattr(sys, "argv", ["eval", "-m", *SMALL[:2], "limit=1", f"pipeline={','.join(pipelines)}"])
     importlib.import_module("fmtorch.commands.eval").main()

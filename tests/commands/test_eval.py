@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from tests.helpers import draw_set, edit_lines
+from tests.helpers import draw_set, edit_lines, write_file
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
 OWN_PRUNER = """import torch
@@ -40,9 +40,7 @@ def rows(run_dir: Path) -> list[dict[str, object]]:
 
 
 def own(folder: Path, group: str, text: str, name: str = "mine") -> list[str]:
-    path = folder / "my_conf" / group / f"{name}.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    write_file(folder / "my_conf" / group / f"{name}.yaml", text)
     return ["--config-dir", "my_conf"]
 
 

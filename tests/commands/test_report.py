@@ -25,7 +25,6 @@ from tests.commands.test_match import stereo
 from tests.helpers import compose, draw, draw_set, pair
 from tests.processes import run_command
 
-SHOWN = Options(count=3, cache="off")
 SIFT = ("pipeline=sift_ratio", "features.max_features=800", "estimator.hypotheses=100")
 MATCH = ("match", "a.png", "b.png", *SIFT)
 
@@ -117,7 +116,7 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
     identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
     RunFolder.open(tmp_path / "run", identity).append(rows)
     (r,) = report.named([RunFolder.load(tmp_path / "run")])
-    pipeline = rebuilt(r, SHOWN)
+    pipeline = rebuilt(r, Options(count=3, cache="off"))
     assert list(pipeline.pruners) == order
     assert shown_pair(first, [r], {r.name: pipeline}).notes == []
     shown = shown_pair(second, [r], {r.name: pipeline})
@@ -192,10 +191,7 @@ def test_paths_with_brackets_are_printed_as_they_are_and_cached_features_take_no
         ("truth=I.txt", "I.txt: a matrix of rank three (its determinant is not 0); F has rank two"),
         ("output=a.png", "a.png: File exists"),
         ("pruner=[ratio,lc] pruner.lc.file=bad.onnx", "bad.onnx is no ONNX network that can be run"),
-        (
-            "features=hardnet features.descriptor={name:hardnet,network:bad.onnx}",
-            "bad.onnx is no ONNX network that can be run",
-        ),
+        ("features=hardnet features.descriptor={name:hardnet,network:bad.onnx}", "bad.onnx is no ONNX network"),
     ],
 )
 def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, words: str, said: str) -> None:

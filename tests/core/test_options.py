@@ -19,7 +19,7 @@ from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.core import Within, checked, claim, create, expect_options, fits
-from tests.helpers import in_threads
+from tests.helpers import in_threads, write_file
 
 Item = TypeVar("Item")
 
@@ -203,10 +203,8 @@ def test_what_does_not_fit_is_named(arguments: dict[str, Any], error: type[Excep
 def test_what_fits_is_handed_on_as_it_is() -> None:
     mask, key = torch.ones(5, dtype=torch.bool), torch.tensor(3)
     given = checked(distance)(F, X, mask, key=key, scale=X[0, 0], steps=4)
-    assert given["F"] is F
-    assert given["x"] is X
-    assert given["mask"] is mask
-    assert given["key"] is key
+    for name, value in {"F": F, "x": X, "mask": mask, "key": key}.items():
+        assert given[name] is value
     assert given["scale"] is not None
     assert given["steps"] == 4
 
@@ -251,8 +249,7 @@ def claimed(folder: Path, settings: dict[str, object], alone: bool = True) -> No
 
 def test_a_folder_is_made_and_found_again(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
-    folder.mkdir(parents=True)
-    (folder / "settings.json.0123.tmp").write_text("{")  # what a killed writer left is nothing
+    write_file(folder / "settings.json.0123.tmp", "{")  # what a killed writer left is nothing
     for _ in range(2):
         claimed(folder, {"seed": 0, "network": {"blocks": 2}})
     (folder / "sketch").write_text("done")

@@ -20,7 +20,8 @@ from fmtorch.data import ImageSource
 from fmtorch.io import MatchStore
 from fmtorch.jobs import DEATH, Execution, WorkerPool, WorkersLost
 from fmtorch.pipeline import FolderMatches, Pipeline, chosen_pairs, folder, folder_workers, images_below
-from tests.helpers import draw
+from tests.data.native import write_image as picture
+from tests.helpers import draw, write_file
 from tests.jobs.work import fatal_pipeline, sift_pipeline
 
 
@@ -49,8 +50,7 @@ def threads(count: int) -> Execution:
 
 @pytest.fixture
 def pipeline() -> Pipeline:
-    built: Pipeline = sift_pipeline()
-    return built
+    return sift_pipeline()
 
 
 @pytest.fixture
@@ -161,33 +161,22 @@ def test_what_was_kept_before_an_end_is_taken(pipeline: Pipeline, images: list[P
     assert again.related == len(pairs)
 
 
-def picture(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
-    return path
-
-
-def text(path: Path, value: str = "{}") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(value)
-
-
 def test_nothing_that_fmtorch_has_written_is_a_photograph(tmp_path: Path) -> None:
     photographs = [picture(tmp_path / name) for name in ("a.jpg", "b.png", "more/c.tif", "more/matches.png")]
     for name in ("matches.png", "pruning.png", "epipolar.png"):
         picture(tmp_path / "matches/a-b" / name)
         picture(tmp_path / name)  # output=.
     for place in ("matches/a-b", "."):
-        text(tmp_path / place / "result.json")
+        write_file(tmp_path / place / "result.json", "{}")
     picture(tmp_path / "set/scene/Images/00000000.jpg")  # an undistorted copy
-    text(tmp_path / "set/pairs.json")
+    write_file(tmp_path / "set/pairs.json", "{}")
     picture(tmp_path / ".thumbnails/a.jpg")
     assert images_below(tmp_path) == sorted(photographs)
     assert images_below(tmp_path / "matches/..") != []
 
 
 def test_a_set_of_pairs_may_be_asked_for(tmp_path: Path) -> None:
-    text(tmp_path / "pairs.json")
+    write_file(tmp_path / "pairs.json", "{}")
     images = [picture(tmp_path / f"scene/Images/{i}.jpg") for i in range(2)]
     assert images_below(tmp_path) == images
 
@@ -215,7 +204,7 @@ def test_sequential_pairs_follow_the_natural_order_of_names(tmp_path: Path) -> N
 def test_folders_of_one_name_have_outputs_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert folder.default_output(tmp_path / "x/photos") == Path("matches/photos")
-    text(tmp_path / "matches/photos/export.json", json.dumps({"images": str(tmp_path / "x/photos")}))
+    write_file(tmp_path / "matches/photos/export.json", json.dumps({"images": str(tmp_path / "x/photos")}))
     assert folder.default_output(Path("x/photos")) == Path("matches/photos")
     other = folder.default_output(tmp_path / "y/photos")
     assert other.name.startswith("photos-")

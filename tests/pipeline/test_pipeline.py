@@ -27,7 +27,7 @@ from fmtorch.io import MatchStore
 from fmtorch.pipeline import FolderMatches, Memo, Pipeline, folder_workers, load_pipeline, match_records
 from fmtorch.presets import instantiate
 from tests.conftest import shared_path
-from tests.helpers import draw, pair
+from tests.helpers import draw, pair, write_file
 from tests.helpers import small_pipeline as pipeline
 from tests.laws import scene
 from tests.processes import run_command
@@ -340,10 +340,6 @@ def outcomes(tmp_path: Path, count: int = 2, **parts: object) -> tuple[Any, list
     return stages, stages.run([pair(f"{i}", images[2 * i], images[2 * i + 1]) for i in range(count)])
 
 
-def no_keys(c: Correspondences) -> Correspondences:
-    return Correspondences(c.x0, c.x1, c.mask)
-
-
 def swapped_sizes(a: Features, b: Features) -> Correspondences:
     sizes = torch.tensor([[600, 10]])
     return matches(a, b).replace(size0=sizes, size1=sizes)
@@ -361,8 +357,15 @@ def swapped_sizes(a: Features, b: Features) -> Correspondences:
          r"<lambda> returned matches that cannot be: score .*\[0, 1\]"),
         ("matcher", swapped_sizes, "swapped_sizes returned matches that cannot be: size0 is .* of x0 lie outside"),
         ("pruners", {"own": lambda c: c.mask}, "^pruning: WrongPart: .* returned a Tensor; it must return Corresp"),
-        ("pruners", {"own": no_keys}, r"no_keys returned matches without their pairs' keys; use c\.keep\(mask\)"),
+        ("pruners", {"own": lambda c: Correspondences(c.x0, c.x1, c.mask)},
+         r"<lambda> returned matches without their pairs' keys; use c\.keep\(mask\)"),
         ("pruners", {"own": lambda c: c[:0]}, "Correspondences of 0 pairs; they must be of 1"),
+        ("pruners", {"own": lambda c: Correspondences(c.x0[:, :5], c.x1[:, :5], c.mask[:, :5], key=c.key)},
+         r"returned matches of shape \(1, 5\); it must be that of the mask, \(1, 9\)"),
+        ("pruners", {"own": lambda c: c.replace(x0=c.x0.sub_(1))}, "WrongPart: .*<lambda> changes what it is given"),
+        ("features", lambda image: image.fill(0), "WrongPart: .*<lambda> changes what it is given, which others use"),
+        ("estimator", 5, r"WrongPart: builtins.int cannot be called; it must have __call__\(c, seed=0\)"),
+        ("estimator", lambda c, seed: estimate(c).replace(ok=torch.tensor([False])), "<lambda> gives no reason$"),
         ("estimator", lambda c, seed: c.x0, "^estimation: WrongPart: .* returned a Tensor; it must return Estimate"),
         ("features", lambda: None, r"WrongPart: .*<lambda> \(test_pipeline.py:\d+\) takes \(\); .* with \(image\)$"),
         ("matcher", lambda a: a, r"\(test_pipeline.py:\d+\) takes \(a\); it is called with \(features0, features1\)$"),
@@ -410,8 +413,7 @@ def test_tracebacks_are_those_of_the_users_code(tmp_path: Path, monkeypatch: pyt
 
 def test_eval_shows_the_line_and_says_how_to_go_on(tmp_path: Path) -> None:
     (tmp_path / "failing_part.py").write_text(PART)
-    (tmp_path / "conf" / "estimator").mkdir(parents=True)
-    (tmp_path / "conf" / "estimator" / "mine.yaml").write_text("_target_: failing_part.Part\nbroken: false\n")
+    write_file(tmp_path / "conf" / "estimator" / "mine.yaml", "_target_: failing_part.Part\nbroken: false\n")
     words = ("--config-dir", "conf", "pipeline=sift_ratio", "estimator=mine", "dataset=stereo", "output=run")
     ended = run_command("eval", *words, cwd=tmp_path)
     assert ended.returncode == 1

@@ -1,6 +1,7 @@
 """Preset files: where they are, how they are read, what they build."""
 
 import functools
+import re
 from pathlib import Path
 
 import hydra
@@ -59,6 +60,18 @@ def test_a_target_that_cannot_be_imported_is_named(target: str, own: Path) -> No
         fmtorch.find_fundamental(c.x0, c.x1, estimator="own", config_dir=own.parents[1])
 
 
+def test_a_preset_that_describes_no_part_says_why(own: Path) -> None:
+    for target, message in (
+        ("fmtorch.estimators.Ransac2", "module fmtorch.estimators has no Ransac2; there are: Ransac, "),
+        ("math", "_target_=math is a module; it must name a class or a function"),
+        ("os.cpu_count", "estimator=own: os.cpu_count returned "),
+        ("fmtorch.estimators.Ransac\nscore: ???", "estimator=own: score is missing"),
+    ):
+        own.write_text(f"_target_: {target}\n")
+        with pytest.raises(ValueError, match=re.escape(message)):
+            presets.build("estimator", "own", own.parents[1])
+
+
 def test_a_users_own_preset_comes_before_the_projects(own: Path) -> None:
     for name in ("irls", "own"):
         own.with_name(f"{name}.yaml").write_text("_target_: fmtorch.estimators.opencv\nmethod: lmeds\n")
@@ -84,12 +97,6 @@ def matches(seed: int) -> GivenMatches:
     return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, ratio=ratio), (40, 40))
 
 
-def pairs_of_families(*families: str) -> list[ImagePair]:
-    image = ImageSource("image", Path("image.jpg"))
-    own = [(str(i), family, functools.partial(matches, i)) for i, family in enumerate(families)]
-    return [ImagePair(name, family, "scene", image, image, np.eye(3), matches=given) for name, family, given in own]
-
-
 def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
     """The ratios of the matches that are left of each pair."""
     left = [outcome.correspondences for outcome in pipeline.correspondences(pairs)]
@@ -99,7 +106,9 @@ def ratios(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
     pipeline = load_pipeline("paper/sift_ratio", overrides=options)
-    pairs = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
+    image, families = ImageSource("image", Path("image.jpg")), ("KITTI", "orbit", "CPC", "mine", "Strecha")
+    own = [(str(i), family, functools.partial(matches, i)) for i, family in enumerate(families)]
+    pairs = [ImagePair(name, family, "scene", image, image, np.eye(3), matches=given) for name, family, given in own]
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
     for pair, kept, limit in zip(pairs, ratios(pipeline, pairs), limits, strict=True):
         given = matches(int(pair.identity)).correspondences.ratio

@@ -32,7 +32,6 @@ CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {
     "ratio": lambda m: keep_ratio(m, 0.8),
     "all": lambda m: swap(rotate(crop(rotate(m, 0, 50), 0, (80, 80, 600, 500)), 1, 90)),
 }
-NOISELESS = Augmentation(noise=None, matches=None)
 ALWAYS = Augmentation(swap=1, quarter_turn=0.5, turn=0.5, angle=180, crop=1, thin=1, noise=(1, 2), matches=(50, 60))
 ONLY = Augmentation.none()
 
@@ -140,7 +139,8 @@ def test_ratio_noise_and_two_swaps() -> None:
 @pytest.mark.parametrize("epoch", range(4))
 def test_the_truth_stays_true_after_any_draw(epoch: int) -> None:
     before = exact(n=400)
-    after = dataclasses.replace(NOISELESS, turn=0.4, quarter_turn=0.4, crop=0.7)(before, seed=0, epoch=epoch)
+    augmentation = Augmentation(noise=None, matches=None, turn=0.4, quarter_turn=0.4, crop=0.7)
+    after = augmentation(before, seed=0, epoch=epoch)
     expect_truth(after)
     assert after.correspondences.mask.all()
     # Every match is one of before, with its label: the ratio says which.
@@ -249,8 +249,6 @@ def test_collate_pads_and_indexing_takes_apart() -> None:
         assert torch.equal(mine.correspondences.lafs1, item.correspondences.lafs1)
     assert len(batch[torch.tensor([True, False, True])]) == 2
     assert len(training.collate([batch, items[0]])) == 4
-    with pytest.raises(ValueError, match="at least one"):
-        training.collate([])
 
 
 def test_shapes_are_checked() -> None:

@@ -135,18 +135,17 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
     assert [about["identity"] for about in matches.pairs] == [good.identity]
     assert dict(matches.failures)["unusable"] == "line 3: F is zero"
     assert "gone.png" in dict(matches.failures)["gone"]
-    with pytest.raises(ValueError, match="1 of 1 pairs have no matches"):
-        MatchedPairs(Some([unusable]), **SIFT, root=tmp_path / "b")
-    with pytest.raises(ValueError, match="no pairs"):
-        MatchedPairs(Some([]), **SIFT, root=tmp_path / "c")
-    with pytest.raises(ValueError, match="no preset 'sift'"):
-        MatchedPairs(Some([good]), "sift", root=tmp_path)
     stages = load_pipeline("sift_ratio")
-    with pytest.raises(ValueError, match="overrides"):
-        MatchedPairs(Some([good]), stages, overrides=["pruner=[]"], root=tmp_path)
     nameless = Pipeline(stages.extractor, lambda a, b: stages.matcher(a, b), {}, stages.estimator)
-    with pytest.raises(ValueError, match="cannot be kept"):
-        MatchedPairs(Some([good]), nameless, root=tmp_path)
+    for pairs, pipeline, overrides, said in (
+        ([unusable], "sift_ratio", SIFT["overrides"], "1 of 1 pairs have no matches"),
+        ([], "sift_ratio", SIFT["overrides"], "no pairs"),
+        ([good], "sift", (), "no preset 'sift'"),
+        ([good], stages, ["pruner=[]"], "overrides"),
+        ([good], nameless, (), "cannot be kept"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            MatchedPairs(Some(pairs), pipeline, overrides=overrides, root=tmp_path / "b")
 
 
 def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs) -> None:
@@ -367,10 +366,8 @@ def test_oanets_files_train_as_the_same_pairs_matched(labels: str, tmp_path: Pat
     place = {about["key"]: i for i, about in enumerate(stored.pairs)}
     order = [place[about["key"]] for about in direct.pairs]
     torch.manual_seed(0)
-    network, objective = (
-        LC(channels=8, blocks=1, coordinates="K"),
-        training.Objective(coordinates="K", classification_steps=0),
-    )
+    network = LC(channels=8, blocks=1, coordinates="K")
+    objective = training.Objective(coordinates="K", classification_steps=0)
     batches = [collate([direct[i] for i in range(len(direct))]), collate([stored[i] for i in order])]
     assert torch.equal(batches[0].label, batches[1].label)
     assert {0, 1} <= set(batches[0].label.unique().tolist())

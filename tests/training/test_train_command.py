@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,9 +22,9 @@ from fmtorch.training import LabelledMatches, Objective, Use, Validation, collat
 from fmtorch.training import run as loop
 from fmtorch.training.run import Optimisation, PrunerTraining, latest_checkpoint, run
 from tests.conftest import own_cache
-from tests.helpers import compose, draw, draw_set
+from tests.helpers import compose, draw, draw_set, write_file
 from tests.io import writers
-from tests.processes import run_command
+from tests.processes import SOURCE, run_command
 from tests.training.conftest import labelled_pair
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
@@ -43,21 +44,14 @@ def root(tmp_path: Path) -> Path:
     return draw_set(tmp_path / "Set", "ab", pairs=[(0, 1), (0, 2), (1, 2)])
 
 
-def documented(title: str) -> list[str]:
-    """The code blocks of a section of docs/guides/training.md."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md").read_text()
-    section = re.split(r"^## ", page.partition(f"## {title}\n")[2], flags=re.MULTILINE)[0]
-    return re.findall(r"```\w+\n(.*?)```", section, flags=re.DOTALL)
-
-
 def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -> None:
     """The files and commands of the docs, in an empty directory, on a small data set."""
     here = tmp_path / "here"
-    here.mkdir()
-    module, preset, commands = documented("A network of your own")
-    (here / "mine.py").write_text(module)
-    (here / "my_conf" / "pruner").mkdir(parents=True)
-    (here / "my_conf" / "pruner" / "mine.yaml").write_text(preset)
+    page = (SOURCE / "docs" / "guides" / "training.md").read_text()
+    section = re.split(r"^## ", page.partition("## A network of your own\n")[2], flags=re.MULTILINE)[0]
+    module, preset, commands = re.findall(r"```\w+\n(.*?)```", section, flags=re.DOTALL)
+    write_file(here / "mine.py", module)
+    write_file(here / "my_conf" / "pruner" / "mine.yaml", preset)
     train, evaluate = (line.removeprefix("fmtorch ").split() for line in commands.strip().splitlines())
     data = ["dataset=fmbench", f"dataset.root={root}"]
     words = [w.strip("'") for w in train if not w.startswith("dataset")]
@@ -76,13 +70,14 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
 
 def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
     """With gloo and mixed precision, on the CPU: each has batches of its own, and gradients are averaged."""
-    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=bf16-mixed"]
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.precision=bf16-mixed", "limit=2"]
     ended = run_command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *SMALL_LC, *two, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     checkpoint = torch.load(tmp_path / "out" / "checkpoints" / "step=6.ckpt", weights_only=True)
     assert checkpoint["global_step"] == 6
     assert all(bool(torch.isfinite(value).all()) for value in checkpoint["state_dict"].values())
-    assert ended.stdout.count("pairs to train on") == 1
+    assert ended.stdout.count("pairs to train on: 2, to validate on: 2 (validation.pairs=2 of each family ") == 1
+    assert "so few pairs (limit=2 of each family) show that it runs" in ended.stdout
     assert (tmp_path / "out" / "lc.safetensors").is_file()
     assert (tmp_path / "out" / "lc.onnx").stat().st_size > 1000
 
@@ -245,6 +240,16 @@ def test_interrupted_it_says_what_is_kept(tmp_path: Path) -> None:
     stopped.on_train_batch_start = stop
     with pytest.raises(KeyboardInterrupt, match=rf"step 6 of {STEPS} is kept in {tmp_path}"):
         train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="hard/AUC@0.05")
+
+
+def test_a_network_that_cannot_be_trained_is_named(tmp_path: Path) -> None:
+    stopped, detached = module(), module()
+    stopped.network.forward = lambda c: sys.exit(3)
+    detached.network.forward = lambda c: c.mask.double()
+    with pytest.raises(RuntimeError, match=r"LC ended the program: sys.exit\(3\)"):
+        train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="log_loss")
+    with pytest.raises(ValueError, match="LC: its log-odds carry no gradient to its parameters"):
+        train(detached, tmp_path, every=5, checkpoint_every=3, monitor="log_loss")
 
 
 def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:

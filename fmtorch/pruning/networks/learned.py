@@ -25,8 +25,7 @@ INPUT, OUTPUT = "matches", "outputs"  # of an ONNX file: (1, channels, N) and (1
 
 def learned_file(name: str | Path, runtime: str) -> Path:
     """Where the file of a name is that a runtime, "torch" or "onnx", reads.
-    A name without a folder and a suffix is among the shipped models: "lc_f" is models/lc_f.onnx. Anything else is a
-    path of the user's own, to which the suffix is added where it has none."""
+    A plain name is a shipped model's: "lc_f" is models/lc_f.onnx. Others are paths, which get the suffix if missing."""
     path = Path(name)
     if path.suffix in SUFFIXES.values():
         return path
@@ -40,8 +39,7 @@ def stated_network(network: nn.Module) -> dict[str, Any]:
 
 
 def metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """What a file says beside its weights, as its metadata; equal contents are equal bytes.
-    temperature: by which log-odds are divided. notes: anything else."""
+    """A file's metadata; equal contents are equal bytes. temperature: of the log-odds. notes: anything else."""
     said = {"network": stated_network(network), "temperature": float(temperature), "notes": dict(notes or {})}
     return {METADATA: json.dumps(said, sort_keys=True)}
 
@@ -139,8 +137,8 @@ class Exportable(Protocol):
 
 def predict(network: nn.Module, c: Correspondences) -> Prediction:
     """What any network says of a batch: one that returns log-odds (B, N) alone gets weights of ``tanh(relu(logit))``.
-    Raises TypeError or ValueError where the network returns something else."""
-    output = network(c)
+    Raises TypeError or ValueError where the network returns something else, RuntimeError where it ends the program."""
+    output = stages.called("c", network, c)
     if isinstance(output, Prediction):
         return output
     if not isinstance(output, Tensor):
@@ -164,11 +162,9 @@ class LearnedPruner:
 
     Args:
         network: maps `Correspondences` to log-odds (B, N) or a `Prediction`.
-        file: its learned file: the name of a shipped one, without suffix, or a path; see `learned_file`. None: the
-            network, of which a copy is taken, stays as it is.
+        file: its learned file, see `learned_file`. None: the network, of which a copy is taken, stays as it is.
         runtime: "torch" reads .safetensors; "onnx" reads .onnx, computes on the CPU, and takes networks that are
-            `Exportable`; "auto" takes what the file's suffix says or, without one, .onnx on a CPU where there is such a
-            file.
+            `Exportable`; "auto" goes by the suffix or, without one, takes .onnx on a CPU if it is there.
         threshold: least P of a match that survives. None: all do.
         prior: whether to supply the prior.
         soft: in place of the two: supply the prior and drop nothing.
@@ -177,8 +173,7 @@ class LearnedPruner:
         command: what makes the file, said where it is missing.
 
     Raises:
-        ValueError: for unknown or contradicting options. NetworkFileError, a ValueError, at the first use: for a file
-            that is absent, unreadable or of another network.
+        ValueError: for unknown or contradicting options. NetworkFileError, one too, at first use: as `load_weights`.
     """
 
     def __init__(
