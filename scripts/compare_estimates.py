@@ -2,7 +2,7 @@
 
     python scripts/compare_estimates.py BEFORE [AFTER] [--presets ransac fmtorch]
 
-Estimator presets of the project run on the same pairs in a process of each checkout (AFTER: this one). Compared are F,
+Estimator presets run on the same pairs in a process of each checkout (AFTER: this one). Compared are models,
 inliers, ok, reasons, samples, models before the final fit, and gradients, besides public functions of
 `fmtorch.geometry`. Exit status 1 where anything differs.
 """
@@ -52,14 +52,14 @@ def dump(pairs: Path, out: Path, names: list[str]) -> None:
         estimator, config = presets.build("estimator", name), presets.load("estimator", name)
         for label, c in batches.items():
             estimate = estimator(c, 0)
-            values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "samples")}
+            values = {f: getattr(estimate, f) for f in ("matrix", "inliers", "ok", "samples")}
             values["reasons"] = torch.tensor(list("\n".join(estimate.reason).encode()), dtype=torch.uint8)
             arrays |= {f"{name} | {label} | {f}": value for f, value in values.items()}
         c = batches["scenes"]
         asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
-        arrays |= with_gradients(f"{name} | F", estimator(c.replace(**asked), 1).F, asked)
+        arrays |= with_gradients(f"{name} | model", estimator(c.replace(**asked), 1).matrix, asked)
         unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else {}
-        arrays[f"{name} | before the final fit"] = presets.build("estimator", name, **unfitted)(c, 0).F
+        arrays[f"{name} | before the final fit"] = presets.build("estimator", name, **unfitted)(c, 0).matrix
     torch.save(arrays, out)
 
 
