@@ -1,6 +1,7 @@
 """What several tests share: pictures, pairs and data sets on disk, a small pipeline, commands in this process."""
 
 import dataclasses
+import errno
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -67,6 +68,18 @@ def small_pipeline(**parts: object) -> Pipeline:
 def unused(*_: object) -> Any:
     """A stage that has nothing to do."""
     raise AssertionError("this stage has nothing to do")
+
+
+def write_file(path: Path, text: str) -> Path:
+    """A file, and the folders in which it is."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def full_disk(*_: object, **__: object) -> Any:
+    """Stands for a function that writes."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def apart(F: np.ndarray, G: np.ndarray) -> float:

@@ -32,6 +32,12 @@ def alive(pid: int) -> bool:
         return False
 
 
+def peak_memory() -> int:
+    """Bytes that this process has held at most; not ru_maxrss, which it inherits from the one that started it."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line.split()[1] for line in lines if line.startswith("VmHWM")))
+
+
 class Command:
     def __init__(self, starter: Starter, pid: int, log: Path) -> None:
         self._starter, self.pid, self.log = starter, pid, log

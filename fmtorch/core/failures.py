@@ -7,8 +7,7 @@ from pathlib import Path
 
 from fmtorch.core.files import PACKAGE
 
-INSTALLED = ("site-packages", "dist-packages")
-"""Folders of other people's code, which is not looked into."""
+INSTALLED = ("site-packages", "dist-packages")  # folders of other people's code, which is not looked into
 
 
 def place_of(error: BaseException) -> str:

@@ -68,10 +68,9 @@ def sync(path: Path) -> None:
 
 
 PACKAGE = Path(__file__).resolve().parents[1]
-STAGES: dict[str, str | list[str]] = {
+STAGES: dict[str, str | list[str]] = {  # the groups of presets that a pipeline chooses from, each with its default
     "features": "sift", "matcher": "nearest", "pruner": ["ratio", "one_to_one"], "estimator": "ransac",
 }  # fmt: skip
-"""The groups of presets that a pipeline chooses from, with what stands where nothing is chosen."""
 
 
 def _folder(name: str) -> Path:
@@ -134,8 +133,7 @@ def claim(file: Path, settings: Mapping[str, Any], holds: str, instead: str, alo
 
 
 def create(file: Path, text: str) -> None:
-    """Write a file unless another process has just done so: of several, the first one wins.
-    Where the file system has no hard links the last one wins."""
+    """Write a file unless another process just has: of several the first wins, without hard links the last."""
     temporary = temporary_name(file)
     try:
         with naming(file, temporary):
@@ -171,6 +169,11 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
             yield from leaves(entry, f"{name}.{key}" if name else key)
     else:
         yield name, json.dumps(value, sort_keys=True)
+
+
+def counted(n: int, noun: str) -> str:
+    """``1 pair``, ``2 pairs``, ``2 matches``."""
+    return f"{n} {noun}" + ("" if n == 1 else "es" if noun.endswith("ch") else "s")
 
 
 def head(items: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import json
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 
 import torch
 from jaxtyping import AbstractArray, Int
@@ -109,8 +109,7 @@ FIXED = {"2": 2, "3": 3}  # dimensions that have a size by their names
 
 class Record:
     """Tensors with a common leading batch dimension, moved, indexed and replaced together.
-    declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each
-    slot."""
+    declared: what the annotations of a kind's tensors say, by field. per_slot: those with an entry a slot."""
 
     declared: ClassVar[Mapping[str, Expected]] = {}
     per_slot: ClassVar[tuple[str, ...]] = ()
@@ -119,11 +118,11 @@ class Record:
         cls.declared = arrays_of(cls)
         cls.per_slot = tuple(name for name, field in cls.declared.items() if SLOTS in field.shape)
 
-    def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
+    def to(self, device: torch.device | str) -> Self:
         """The same record with every tensor on `device`."""
         return self._each(lambda value: value.to(device))
 
-    def detach(self: AnyRecord) -> AnyRecord:
+    def detach(self) -> Self:
         """The same record cut off from the graph."""
         return self._each(lambda value: value.detach())
 
@@ -134,18 +133,18 @@ class Record:
             return False
         return any(isinstance(v, Tensor | Record) and v.requires_grad for v in vars(self).values())
 
-    def replace(self: AnyRecord, **changes: Any) -> AnyRecord:
+    def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed (shapes are checked again)."""
-        return cast(AnyRecord, dataclasses.replace(cast(Any, self), **changes))
+        return cast(Self, dataclasses.replace(cast(Any, self), **changes))
 
     @classmethod
-    def unchecked(cls: type[AnyRecord], **fields: Any) -> AnyRecord:
+    def unchecked(cls, **fields: Any) -> Self:
         """A record of all its fields, unchecked: of tensors that fit because of how they are made."""
         record = object.__new__(cls)
         vars(record).update(fields)
         return record
 
-    def derived(self: AnyRecord, **changes: Any) -> AnyRecord:
+    def derived(self, **changes: Any) -> Self:
         """As `replace`, unchecked, by tensors that fit because of how they are made of this record: not a user's."""
         return self.unchecked(**{**vars(self), **changes})
 
@@ -163,7 +162,7 @@ class Record:
             save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, stored)
 
     @classmethod
-    def load(cls: type[AnyRecord], path: Path | str) -> AnyRecord:
+    def load(cls, path: Path | str) -> Self:
         """The record that `save` wrote, on the CPU, checked again.
         Raises FileNotFoundError, or ValueError for another file."""
         try:
@@ -185,10 +184,10 @@ class Record:
         shapes = (f"{name}: {tuple(x.shape)} {str(x.dtype).removeprefix('torch.')}" for name, x in tensors)
         return f"{type(self).__name__}({', '.join(shapes)})"
 
-    def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
+    def _map(self, function: Any, **changes: Any) -> Self:
         return self.replace(**_mapped(self, function, Record._map), **changes)
 
-    def _each(self: AnyRecord, function: Any) -> AnyRecord:
+    def _each(self, function: Any) -> Self:
         """As `_map`, of a function that keeps shape and kind."""
         return self.derived(**_mapped(self, function, Record._each))
 

@@ -26,8 +26,7 @@ Progress = Callable[[int, int], None]
 def load(
     name: str, split: str = "test", root: str | Path | None = None, progress: Progress | None = None, **options: Any
 ) -> PairDataset:
-    """The data set ``conf/dataset/<name>.yaml``: an indexable of `ImagePair`; torch's DataLoader
-    takes it with ``collate_fn=list``.
+    """The data set ``conf/dataset/<name>.yaml`` of `ImagePair`; for torch's DataLoader, with ``collate_fn=list``.
 
     Args:
         name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, pair_list, hpatches, h5.

@@ -22,8 +22,7 @@ from fmtorch.data.scenes import ScenePairs, View, image_pair, incidence
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns
 TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface
 
-Place = tuple[int, int, int]
-"""Number of the scene, and of its two views."""
+Place = tuple[int, int, int]  # number of the scene, and of its two views
 
 
 def overlap_of(dataset: ScenePairs) -> "DepthOverlap | PointOverlap":

@@ -21,8 +21,7 @@ COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
 class CameraFilePairs(ScenePairs):
     """Pairs of images ``<scene>/Images/%08d.jpg`` (or .png), whose cameras are the lines of ``<scene>/Camera.txt``.
     root: a folder of scenes, or one scene's folder. sequences: names of scenes to take; None: all.
-    fps: frames a second of videos, of which frames at most `window` seconds apart make pairs; None: all pairs.
-    pairs, seed: as in `ScenePairs`."""
+    fps: frames a second of videos, paired within `window` seconds; None: all pairs. pairs, seed: as in `ScenePairs`."""
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
@@ -76,9 +75,8 @@ class FMBenchPairs(HeldPairs):
     cameras: read ``<subset>/Camera.txt`` where it stands, for K, R and t.
 
     A pair's family is its set, its scene the subset, its identity ``<set>/<subset>/<l>-<r>``; image 0 is l.
-    A line with a NaN, infinite or zero F or a missing image becomes a pair with a `problem`; whatever makes the files
-    themselves unreliable raises DataError: a missing file, a wrong number of columns, files of different lengths,
-    an entry that is no number."""
+    A line with a NaN, infinite or zero F or a missing image becomes a pair with a `problem`; whatever makes files as a
+    whole unreliable raises DataError: a missing one, a wrong number of columns, different lengths, no number."""
 
     name = "fmbench"
 

@@ -14,10 +14,9 @@ from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import HeldPairs, ImagePair, ImageSource, Resampling, scaled_size
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
-LARGE = (
+LARGE = (  # of large images, left out by the field since D2-Net (Dusmanu et al., CVPR 2019): 108 of 116 stay
     "i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding", "v_artisans", "v_astronautis", "v_talent",
 )  # fmt: skip
-"""Sequences of large images, which the field leaves out since D2-Net (Dusmanu et al., CVPR 2019): 108 of 116 stay."""
 SUFFIXES = (".ppm", ".png", ".jpg")
 OTHERS = range(2, 7)  # images of a sequence that image 1 is paired with
 

@@ -36,8 +36,7 @@ class ImageCamera(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ModelImage:
-    """An image: R, t map the world to the camera; points are the numbers of the 3-D points that it sees.
-    place: file and line, or record, with which messages begin."""
+    """An image: R, t map world to camera; points: numbers of 3-D points seen. place: file and line, for messages."""
 
     name: str
     camera: int
@@ -261,13 +260,12 @@ def exif_focal(path: Path | str, size: tuple[int, int] | None = None) -> ExifFoc
 
     Args:
         path: a JPEG, PNG, TIFF or WebP file. Only its header is read, and no damage to it raises an error.
-        size: (h, w) of the image that the focal length is for, in either orientation, where it is not the file's: it
-            was reduced, not cropped.
+        size: (h, w) of the image that it is for, in either orientation, where not the file's: reduced, not cropped.
 
     Returns:
         The focal length, its relative deviation and its source. A whole number of millimetres is known to half of one,
-        which the deviation includes. Not known, with the reason in `source`, where the file cannot be read or lacks the
-        tags, where its sides are not in the ratio that the camera recorded (a crop), or where the number is absurd.
+        which the deviation includes. Not known, with the reason in `source`, for an unreadable file, missing tags,
+        another ratio of sides than was recorded (a crop) or an absurd number.
     """
     read = _read(Path(path))
     if isinstance(read, str):
@@ -338,14 +336,9 @@ SHOWN = 5  # names that an error shows
 
 class ImageCameras:
     """The cameras of a file, looked up by the paths of images.
-
-    Args:
-        path: a COLMAP model, its folder or one of its files ``cameras.txt``, ``cameras.bin``; a ``cameras.txt`` without
-            ``images.txt`` beside it, whose one camera is that of every image; or a JSON file of `FORM`.
-
-    Raises:
-        DataError: for a file that is missing or damaged, or holds something else.
-    """
+    path: a COLMAP model, its folder or one of its files ``cameras.txt``, ``cameras.bin``; a ``cameras.txt`` without
+    ``images.txt`` beside it, whose one camera is that of every image; or a JSON file of `FORM`.
+    Raises DataError for a file that is missing or damaged, or holds something else."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -21,8 +21,7 @@ _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
 _TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
 
-MAX_PIXELS = 2**28
-"""Larger images are refused by their headers: a few kilobytes may claim gigabytes. The largest sensors have 2e8."""
+MAX_PIXELS = 2**28  # by the header: a few kilobytes may claim gigabytes; the largest sensors have 2e8
 
 
 class ImageError(ValueError):

@@ -203,12 +203,10 @@ class PairList(HeldPairs):
             (`fmtorch.data.pair_list`); or a text file with the name of such an ``.npz`` in each line.
         resize: what images are resized to when read, px: one number for the longer side, [width, height] for both;
             None: not at all, but for lists of ScanNet whose K are of 640 x 480. K follows.
-        origin: where the list's K puts the centre of the first pixel; None: 0.5 for glue-factory's lists and for
-            MegaDepth's ``.npz``, otherwise 0.
+        origin: the first pixel's centre in K; None: 0.5 for glue-factory's lists and MegaDepth's ``.npz``, otherwise 0.
 
     A pair's family is the list, its scene the first folder in which the names of the list differ. A pair with a missing
-    image or without a sound camera has a `problem`. Raises DataError, naming file and line, for a list that cannot be
-    read.
+    image or without a sound camera has a `problem`. Raises DataError, naming file and line, for other lists.
     """
 
     name = "pair_list"

@@ -69,8 +69,7 @@ class ImageSource:
     identity: names it within its data set.
     size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
     lens: whose distortion `read_image` takes out; None for an image without.
-    resampling: how `read_image` then resizes and turns it; None: not at all.
-    data: the bytes of the file, for a worker that does not see it; None: they are read from `path`."""
+    resampling: how `read_image` then resizes and turns it. data: the file's bytes, where a worker cannot read it."""
 
     identity: str
     path: Path
@@ -96,8 +95,7 @@ class GivenMatches(NamedTuple):
 class ImagePair:
     """Two images of one scene and how they are related.
     identity: unique within the data set, e.g. ``Strecha/fountain-P11/3-7``.
-    family: what results are grouped by (a data set, or a family of rendered scenes).
-    scene: the cluster for the bootstrap, e.g. ``fountain-P11``.
+    family: what results are grouped by (a data set, say). scene: the cluster for the bootstrap, ``fountain-P11``.
     F: (3, 3) float64 with ``x1^T F x0 = 0`` in pixels.
     K0, K1: (3, 3), R: (3, 3), t: (3,) with ``X1 = R X0 + t``, where known.
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.

@@ -28,13 +28,11 @@ def colmap_pairs(
 
     Args:
         root: a folder of scenes, or one scene's folder, which is taken whatever the split.
-        split: test (Panther, Playground, Train, Roman_Forum) or train (Family, Francis, Horse, Lighthouse, M60), as in
-            the paper.
+        split: test (Panther, Playground, Train, Roman_Forum) or train (Family, Francis, Horse, Lighthouse, M60).
         sequences: names of scenes to take instead.
         model: folder within the scene's; None: the first of sparse/0, sparse, dense/sparse and the scene's.
         images: folder within the scene's.
-        candidates: all pairs of a scene, or those whose images share at least `shared` points of the reconstruction.
-        shared: that number.
+        candidates, shared: all pairs of a scene, or those whose images share at least so many points of the model.
         pairs, seed: as in `ScenePairs`.
         family: of the pairs; None: the name of the folder of scenes.
         depth: know the depth of points, for labels, where every scene has depth maps of COLMAP's dense reconstruction,

@@ -1,5 +1,4 @@
-"""Which pairs of a scene's images are worth a look: of a video those a second apart, of a collection all, or those
-that see the same points of its reconstruction."""
+"""Which pairs of a scene's images to look at: in videos those a second apart, else all, or those sharing 3-D points."""
 
 import dataclasses
 import functools
@@ -52,8 +51,7 @@ class ListedPairs:
         return self.pairs[ranks]
 
 
-Candidates = AllPairs | ListedPairs
-"""Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
+Candidates = AllPairs | ListedPairs  # pairs (i, j), i < j, in a fixed order; not necessarily all in memory
 
 
 def following(times: Sequence[float] | Matrix, window: int | float = WINDOW) -> ListedPairs:
@@ -68,8 +66,7 @@ def following(times: Sequence[float] | Matrix, window: int | float = WINDOW) -> 
 
 def sharing_points(points: Sequence[Indices], minimum: int = MIN_SHARED) -> ListedPairs:
     """The pairs of images that both see at least `minimum` points; points: of each image the numbers it sees.
-    Memory is that of the pairs found; a reconstruction of n images with a mean track of m images has, in all, about
-    m / 2 such pairs for each point, most of them the same ones over and over."""
+    Memory is that of the pairs found: about m / 2 for each point of a mean track of m images, mostly the same ones."""
     sees = incidence(points)
     blocks = []
     for begin in range(0, len(points), _AT_ONCE):
@@ -107,7 +104,7 @@ def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
 
 # Which sequences the paper trains and tests on (Bian et al., BMVC 2019, Section 4 and its supplement)
 
-SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
+SPLITS: dict[str, dict[str, tuple[str, ...]]] = {  # names of sequences or scenes; without `train`: all others
     "tum": {"test": tuple(f"rgbd_dataset_freiburg3_{n}" for n in ("teddy", "large_cabinet", "long_office_household"))},
     "kitti": {"test": ("06", "07", "08", "09", "10"), "train": ("00", "01", "02", "03", "04", "05")},
     "colmap": {
@@ -115,13 +112,11 @@ SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
         "train": ("Family", "Francis", "Horse", "Lighthouse", "M60"),
     },
 }  # fmt: skip
-"""By data set and split the names of sequences or scenes. Without `train` these are all others."""
 
 
 def chosen(name: str, split: str, sequences: Sequence[str] | None, there: Sequence[str]) -> list[str]:
     """The sequences to read: those asked for, or those of the split.
-    there: the names of those on disk, among which a split of "all others" chooses. Raises DataError for an unknown
-    split, and where no sequence is left."""
+    there: those on disk, for a split of "all others". Raises DataError for an unknown split, and where none is left."""
     if split not in ("test", "train"):
         raise DataError(f"split {split!r}; there are test and train")
     if sequences is not None:
@@ -188,8 +183,7 @@ def read_grey(path: Path) -> Array:
 
 @functools.lru_cache(maxsize=_KEPT)
 def read_colmap(path: Path) -> Singles:
-    """A depth map of COLMAP's dense reconstruction (h, w): ``width&height&1&``, then float32, row by row.
-    Raises ImageError for anything else."""
+    """COLMAP's depth map (h, w): ``width&height&1&``, then float32, row by row. Raises ImageError for anything else."""
     _expect_file(path)
     content = path.read_bytes()
     header = _COLMAP_HEADER.match(content)
@@ -239,11 +233,9 @@ class ScenePairs(PairDataset):
     pairs: how many, drawn at random from the candidates of all scenes; None: all. seed: of that draw.
     depth: of points (n, 2) of an image, in the unit of t, where the views have depth: it is a `DepthDataset` then.
 
-    points: of each scene a function that reads which points of its reconstruction each view sees, by their numbers;
-    None where there is no reconstruction.
+    points: of each scene what reads which points each view sees, by numbers; None without a reconstruction.
 
-    A pair whose image is missing, or whose two cameras are at one place, has a `problem`. Which pairs can be matched
-    at all is not asked here (`fmtorch pairs`)."""
+    A pair with a missing image or both cameras at one place has a `problem`. Whether it matches is not asked."""
 
     points: Sequence[Callable[[], Sequence[Indices]]] | None = None
 

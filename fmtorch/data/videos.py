@@ -25,8 +25,7 @@ class KittiPairs(ScenePairs):
     sequences: names to take instead of those of the split. camera: 0 to 3, whose images ``image_N`` are taken.
     pairs, seed: as in `ScenePairs`.
 
-    The images are rectified: nothing is undistorted. Cameras are ``P_N [R | t]^-1``. Raises DataError, naming file and
-    line, for files that are missing, truncated or contradict one another."""
+    The images are rectified; cameras are ``P_N [R | t]^-1``. Raises DataError, naming file and line, for bad files."""
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
@@ -81,12 +80,11 @@ def _kitti_scene(home: Path, folder: Path, camera: int, window: int | float) -> 
 
 
 SIZE = (480, 640)  # h, w of all images
-CALIBRATIONS = {
+CALIBRATIONS = {  # colour cameras, as the set's page has them for OpenCV; freiburg3's images are undistorted
     "freiburg1": Lens(517.3, 516.5, 318.6, 255.3, "FULL_OPENCV", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633, 0, 0, 0)),
     "freiburg2": Lens(520.9, 521.0, 325.1, 249.7, "FULL_OPENCV", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0, 0, 0)),
     "freiburg3": Lens(535.4, 539.2, 320.1, 247.6),
 }
-"""The colour cameras as the set's page gives them, for OpenCV; the images of freiburg3 are undistorted already."""
 TOLERANCE = 0.02  # s between a frame and the poses around it, or its depth image: that of the set's own tools
 DEPTH_SCALE = 5000.0  # of a depth image, per metre
 
@@ -112,8 +110,7 @@ def tum_pairs(
 
     The images of freiburg1 and freiburg2 are undistorted when they are read; those of freiburg3 are so already. The
     pose of a frame is interpolated between the two around it (linearly, and along the great circle); frames farther
-    than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for files that are missing,
-    damaged or out of order.
+    than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for damaged files.
     """
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())

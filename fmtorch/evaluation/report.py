@@ -50,8 +50,7 @@ class Picture(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A pair as one run sees it. nsgd: None where it failed, with the reason. pair_type: empty where unknown.
-    corner_error: px, in place of NSGD where the pair has a homography."""
+    """A pair as a run sees it. nsgd: None if it failed. pair_type: "" if unknown. corner_error: px, of homographies."""
 
     run: str
     nsgd: float | None
@@ -84,8 +83,7 @@ class ShownPair(NamedTuple):
 
 class Section(NamedTuple):
     """The runs on one data set: tables of `PAIR_SCHEMA` by the runs' names, the first is what others differ from.
-    notes: what the reader should know of the pictures of pairs, or why there are none. signed: the runs in which the
-    sign of a translation counts."""
+    notes: what to know of the pictures of pairs, or why there are none. signed: runs in which the sign of t counts."""
 
     heading: str
     runs: Mapping[str, pa.Table]

@@ -2,8 +2,7 @@
 
 Metrics are float64 and computed on the CPU: so little work needs no GPU. Threads share features and networks and start
 at once, but only one of them issues torch operations at a time: enough where detectors, networks and OpenCV do the
-work. Processes use all cores for estimators too, at some seconds and some hundred megabytes each. Rows and exports come
-back to the caller, who alone writes."""
+work. Processes use all cores for estimators too, at seconds and hundreds of megabytes each. The caller alone writes."""
 
 import contextlib
 import dataclasses
@@ -222,8 +221,7 @@ def _focal(K: NDArray[np.float64] | None) -> float | None:
     return math.sqrt(product) if product > 0 else None
 
 
-PLACES = ("root", "file", "truth", "images")
-"""Options of data sets that say where things lie; the digest says what they are."""
+PLACES = ("root", "file", "truth", "images")  # options that say where a data set lies; its digest says what it is
 
 
 def run_identity(
@@ -235,8 +233,7 @@ def run_identity(
     Args:
         config: a composed config: stages, data set, seed. pipeline_name: the preset that it began with.
         pipeline: what was built of the config. dataset_digest: of the contents of the data set.
-        cameras, lens: what the estimator is given of them; None: nothing. signed: whether the sign of a translation
-            counts.
+        cameras, lens: what the estimator is given of them; None: nothing. signed: whether the sign of t counts.
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
@@ -343,8 +340,7 @@ class Batch(NamedTuple):
 
 class Work(NamedTuple):
     """The rows of a batch.
-    computed, from_cache: images whose features a process computed or took from the cache for it. tracebacks: of
-    `Pipeline.tracebacks`."""
+    computed, from_cache: images whose features a process computed or had for it. tracebacks: `Pipeline.tracebacks`."""
 
     rows: list[PairRow]
     computed: int = 0
@@ -409,10 +405,9 @@ def evaluate_pairs(
     journal: MatchStore | None = None, signed: bool = False,
 ) -> Iterator[int]:  # fmt: skip
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
-    execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
-    journal: keeps keypoints, matches and F for an export. signed: of `pose_errors`. Rows and journal are written here.
-    Results do not depend on `batch` or `execution`. Raises WorkersLost where workers die whatever they do, or a
-    scheduler is gone."""
+    execution: by which workers. build: makes the same pipeline in another process, where these are no threads. journal:
+    keeps keypoints, matches and F for an export. signed: of `pose_errors`. Rows and journal are written here. Results
+    do not depend on `batch` or `execution`. Raises WorkersLost as `TaskRunner.each`."""
     pool = WorkerPool(execution, PRELOADED, limit=max(1, len(pairs)))
     if pool.size > 1:  # no one of several workers shall be long alone at the end
         batch = max(1, min(batch, -(-len(pairs) // (BATCHES_OF_A_WORKER * pool.size))))

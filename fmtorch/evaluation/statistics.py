@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from fmtorch import metrics
+from fmtorch.core.files import counted
 from fmtorch.core.types import PAIR_TYPES
 from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
@@ -67,8 +68,7 @@ def recalled(nsgd: Values, threshold: float = THRESHOLD) -> Values:
 
 
 def areas(nsgd: Values) -> Values:
-    """What each pair adds to AUC@0.05, (n,): the share of thresholds from 0 to 0.05 above its NSGD; mean over seeds.
-    nsgd: (n,), or (seeds, n); NaN is a miss."""
+    """What each pair adds to AUC@0.05, (n,): the share of thresholds from 0 to 0.05 above its NSGD; see `recalled`."""
     return _per_pair(metrics.mean_recall(torch.from_numpy(nsgd)[..., None], THRESHOLD))
 
 
@@ -86,8 +86,7 @@ def pose_figures(rotation: Values, translation: Values, signed: bool = False) ->
     """Accuracy of poses over the pairs whose true pose is known; None where there is none.
     rotation, translation: angles in degrees of each pair, (n,); NaN where the true pose is unknown. signed: whether the
     sign of a translation counts, as it was told. auc_5, auc_10, auc_20: `fmtorch.metrics.pose_auc` of the larger of the
-    two angles; map_5, map_10, map_20: its binned mAP, `pose_map`; maa_10: `pose_maa`; rotation, translation: median
-    angles."""
+    two angles; map_5, map_10, map_20: its binned mAP, `pose_map`; maa_10: `pose_maa`; the others: medians."""
     known = ~(np.isnan(rotation) | np.isnan(translation))
     if not known.any():
         return None
@@ -136,8 +135,7 @@ def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> 
 def homography_figures(errors: Values) -> dict[str, float | int | None] | None:
     """Accuracy of homographies over the pairs whose true one is known; None where there is none.
     errors: corner errors in pixels, (n,), infinite where a pair failed, NaN where no homography is known. auc_1px,
-    auc_3px, auc_5px: area under the recall curve of the corner error (`fmtorch.metrics.pose_auc`); corner_error: the
-    median, None where that is infinite."""
+    auc_3px, auc_5px: `fmtorch.metrics.pose_auc` of them; corner_error: the median, None where that is infinite."""
     known = errors[~np.isnan(errors)]
     if not len(known):
         return None
@@ -187,9 +185,8 @@ def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
 
 def described(scenes: Sequence[str]) -> str:
     """``79 pairs of 2 scenes, intervals over pairs``: how many there are, and what intervals resample."""
-    count = len(set(scenes))
-    pairs = f"{len(scenes)} pair{'s' * (len(scenes) != 1)}"
-    return f"{pairs} of {count} scene{'s' * (count != 1)}, intervals over {unit(scenes)}s"
+    pairs, distinct = counted(len(scenes), "pair"), counted(len(set(scenes)), "scene")
+    return f"{pairs} of {distinct}, intervals over {unit(scenes)}s"
 
 
 def unit(scenes: Sequence[str]) -> str:
@@ -227,8 +224,7 @@ def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float
     """How many independent pairs tell as much of the mean as these, which come in scenes; at most n.
     n divided by the design effect: the variance of the mean with whole scenes as units over that with pairs as units,
     at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
-    fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
-    values, scenes: one per pair, (n,), n >= 1."""
+    fewer than `MIN_SCENES` scenes, and where all values are equal. values, scenes: per pair, (n,), n >= 1."""
     n, m = len(values), len(set(scenes))
     centred = values - values.mean()
     alone = float((centred**2).sum()) * n / (n - 1) if n > 1 else 0.0
@@ -283,18 +279,14 @@ def summarize(table: pa.Table, signed: bool = False) -> dict[str, Group]:
     All shares are in [0, 1]; a figure that is not defined is None. Of each group:
 
     - pairs, scenes: how many.
-    - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % score
-      interval, and interval_over: the unit that is independent (see `share_interval`). recall_fine: at NSGD < 0.01.
-      auc_05: AUC@0.05, the mean of recall over the thresholds from 0 to 0.05. recall_released: by the published
-      evaluator's NSGD, where that was computed for each pair that did not fail.
+    - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % score interval,
+      and interval_over: the unit that is independent (see `share_interval`). recall_fine: at NSGD < 0.01. auc_05:
+      AUC@0.05, mean recall over thresholds from 0 to 0.05. recall_released: by `nsgd_released`, where computed.
     - inlier_rate: share of the estimator's inliers that obey the true F, and inlier_rate_before: share of the matches
-      given to it; means over the pairs that did not fail, as the paper; ``*_failures_0``: means over all pairs with 0
-      for failures and where there is no figure.
+      given to it; means over pairs that did not fail, as the paper; ``*_failures_0``: over all, 0 where there is none.
     - corrs, corrs_before: number of inliers and of matches given to the estimator; means over pairs that did not fail.
-    - failures, failure_share, reasons: the commonest reasons and how often; reasons that differ in numbers alone are
-      one, with the range of these.
-    - homography: of the pairs whose true homography is known, which have no NSGD and no recall, see
-      `homography_figures`; None where there are none.
+    - failures, failure_share, reasons: the commonest reasons and how often, see `common_reasons`.
+    - homography: of pairs with a true homography, which have no NSGD, see `homography_figures`; None without any.
     - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
     - labels: of given matches of pairs with known cameras, see `label_figures`; None where there are none.
     - pair_types: how many pairs are in each of `PAIR_TYPES`; None where none is known.

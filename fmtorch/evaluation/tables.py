@@ -109,7 +109,7 @@ class Part(NamedTuple):
     ranked: Mapping[str, str] = {}
 
 
-POSE = {
+POSE = {  # what is said of poses, by whether the sign of a translation counts
     False: "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, which is "
     "folded: its sign does not count. Failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean "
     "of recall at 1°, ..., 10°; R error, t error: medians.",
@@ -117,7 +117,6 @@ POSE = {
     "counts (pose.signed=true); of an F without cameras, of the best of its four poses, as PoseBench. Failures count "
     "as 180°. AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; R error, t error: medians.",
 }
-"""What is said of poses, by whether the sign of a translation counts."""
 BINNED = " mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
 PROTOCOL = (
     "As learned pruners are published; failures are misses. mAP: mean of recall at 5°, 10°, ..., beside mAP5° and "

@@ -205,8 +205,7 @@ WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] 
     "posebench": functools.partial(_pairs, keys_of=h5.keys, read=_posebench_pair),
     "oanet": functools.partial(_pairs, keys_of=oanet.keys, read=_oanet_pair),
 }
-WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
-"""Layouts that hold matches alone, and where they put the centre of the first pixel."""
+WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}  # of the first pixel's centre
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 
@@ -221,8 +220,7 @@ class H5Pairs(HeldPairs):
         features, matches: names of hloc's two files in root; looked for when not given.
         origin: coordinates of the first pixel's centre; of the layout's convention when not given.
 
-    What is wrong with one pair is that pair's `problem`, or its failure when it is read. Raises DataError for what is
-    wrong with files as a whole."""
+    What is wrong with one pair is its `problem`, or its failure when read. Raises DataError for files as a whole."""
 
     name = "h5"
 

@@ -17,10 +17,9 @@ from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.io.colmap import among, imported
 from fmtorch.io.match_store import ORIGIN, Kind, PairGeometry, two_view_geometry
 
-KINDS: Mapping[str, Kind] = {
+KINDS: Mapping[str, Kind] = {  # COLMAP's configurations by the pair types that are not general
     "planar": "planar", "rotation": "panoramic", "identical": "planar_or_panoramic", "unrelated": "degenerate",
 }  # fmt: skip
-"""COLMAP's configurations by the pair types that are not general."""
 
 
 @contextlib.contextmanager
@@ -107,13 +106,8 @@ def _lightglue_matches(matches: Mapping[str, Any], b: int | None) -> tuple[Tenso
 @_taking("a dictionary with keypoints0, keypoints1 and, if known, confidence and batch_indexes")
 def from_kornia(matches: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of `find_*` for the dictionary of a detector-free matcher of kornia, such as `kornia.feature.LoFTR`.
-
-    Args:
-        matches: with `keypoints0`, `keypoints1` (N, 2), `confidence` (N,), and `batch_indexes` (N,) of several pairs.
-
-    Returns:
-        x0, x1 and score of one pair, or lists of them.
-    """
+    matches: with `keypoints0`, `keypoints1` (N, 2), `confidence` (N,), and `batch_indexes` (N,) of several pairs, for
+    which x0, x1 and score are lists."""
     names = {"x0": "keypoints0", "x1": "keypoints1", "score": "confidence"}
     fields = {name: as_tensor(matches[key], key) for name, key in names.items() if key in matches or name != "score"}
     pair = as_tensor(matches.get("batch_indexes", torch.zeros(len(fields["x0"]))), "batch_indexes")
@@ -160,12 +154,8 @@ def from_colmap(geometry: Any, matches: Any) -> Estimate:
     """The estimate that a `pycolmap.TwoViewGeometry` describes, in pixels with (0, 0) at the first pixel's centre.
 
     Args:
-        geometry: with F, or with H alone, of which the estimate is then.
-        matches: keypoints of both images (N, 2), of which the geometry's inliers are some; or their number N where
-            match i is of keypoint i in both.
-
-    Returns:
-        An `Estimate` of one pair; R, t and E where the geometry has a pose.
+        geometry: with F, or with H alone, of which the estimate is then; R, t and E where it has a pose.
+        matches: keypoints of both images (N, 2), inliers among them; or N where match i is of keypoint i in both.
     """
     if isinstance(matches, int):
         matches = _same(matches)
@@ -183,11 +173,7 @@ def from_colmap(geometry: Any, matches: Any) -> Estimate:
 
 def to_poselib(estimate: Estimate) -> Any:
     """The `poselib.CameraPose` of an estimate of one pair with a pose.
-
-    Raises:
-        ValueError: for several pairs, and where there is no pose.
-        ImportError: without poselib.
-    """
+    Raises ValueError for several pairs and where there is no pose, ImportError without poselib."""
     _expect_one(estimate, "to_poselib")
     R, t = _matrix(estimate.R), _matrix(estimate.t)
     if R is None or t is None:

@@ -6,7 +6,7 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from fmtorch.io.match_store import MATRICES, PairGeometry
 
 MEMORY = 256  # images whose keypoints are kept
 Names = tuple[str, str]
-OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
 
 
 class _OpenFiles:
@@ -28,7 +27,7 @@ class _OpenFiles:
         self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self: OpenFiles) -> OpenFiles:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

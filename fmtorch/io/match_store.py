@@ -91,8 +91,7 @@ class StoredImage:
 class StoredPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
     F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
-    and NaN where it was not computed. pair_type: of the cameras and the scene; empty where it is not known, and
-    geometry, for COLMAP, None."""
+    and NaN where it was not computed. pair_type: empty where it is not known. geometry: for COLMAP."""
 
     name0: str
     name1: str

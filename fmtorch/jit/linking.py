@@ -15,8 +15,7 @@ SYMBOL = "fmtorch_kernel:{module}:{name}:"  # of a cell; colons, since machine c
 _NAME = re.compile(rb"fmtorch_kernel:([\w.]+):(\w+):")
 RETURNED = {"None": "none", "bool": "boolean", "int": "int64", "float": "float64"}  # numba's types, by annotation
 _cells: dict[str, ctypes.c_void_p] = {}
-KERNELS: dict[tuple[str, str], Any] = {}
-"""All kernels of this process, by module and name."""
+KERNELS: dict[tuple[str, str], Any] = {}  # all kernels of this process, by module and name
 
 
 def cell(module: str, name: str) -> ctypes.c_void_p:

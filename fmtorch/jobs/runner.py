@@ -285,8 +285,7 @@ class TaskRunner(Generic[Task]):
     def each(self, tasks: Iterable[Task | None]) -> Generator[Task, None, None]:
         """Have the tasks done, and yield each once its result is kept.
         tasks: taken as workers become free; a None says that none can begin before one under way has ended.
-        Interrupted, it waits for what is under way and keeps it. What a task raises is raised here. Raises WorkersLost
-        where the scheduler is gone, or workers die whatever they do."""
+        Interrupted, it waits for what is under way and keeps it. Raises what tasks do; WorkersLost where none work."""
         todo = iter(tasks)
         try:
             while True:

@@ -350,8 +350,7 @@ def _two_nearest(rows: Tensor, columns: Tensor, chunk: int) -> tuple[list[Tensor
 
 def _two_smallest(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of every row the first index of its smallest value, that value and the second smallest.
-    The minima of groups of columns lead to the group with the smallest value; the second smallest is in the same
-    group or is the minimum of another one."""
+    The minima of groups of columns lead to the smallest value; the second is in its group or another's minimum."""
     groups = squared.reshape(len(squared), -1, GROUP)
     minima = groups.amin(-1)
     group = minima.argmin(1, keepdim=True)
@@ -379,8 +378,7 @@ class NearestNeighborMatcher:
     chunk: int = 64
 
     def __call__(self, features0: Features, features1: Features) -> Correspondences:
-        """The matches of one pair (a batch of one), or of a batch of pairs when the features have a leading dimension.
-        Raises ValueError when the two batches or descriptor lengths differ."""
+        """The matches of one pair, or of a batch where features have a leading dimension; ValueError if both differ."""
         shape0, shape1 = features0.descriptors.shape, features1.descriptors.shape
         if shape0[:-2] != shape1[:-2] or shape0[-1] != shape1[-1]:
             both = f"{tuple(shape0)} and {tuple(shape1)}"

@@ -2,8 +2,7 @@
 
 The package (github.com/gmberton/vismatch, formerly image-matching-models) has one call for all of its matchers:
 ``get_matcher(name, device)(image0, image1)`` gives a mapping with ``matched_kpts0``, ``matched_kpts1`` (N, 2) and
-perhaps ``matched_confidences`` (N,). It downloads the weights of a matcher when that is first used; nothing is
-downloaded here."""
+perhaps ``matched_confidences`` (N,). It downloads the weights of a matcher when that is first used."""
 
 import threading
 from collections.abc import Mapping, Sequence

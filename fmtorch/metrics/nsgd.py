@@ -35,8 +35,7 @@ RELEASED_BORDER, NORMAL_OFFSET = 0.5, 1e-10  # of `nsgd_released`: pixels count 
 
 class Comparison(NamedTuple):
     """Two models of each pair, or of one, F_gt, F_est (3, 3), for `nsgd` scaled to a largest element of 1.
-    size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided. key:
-    (1,), selects the draws."""
+    size0, size1: (h, w), px. unit: (2,), by which distances in images 0 and 1 are divided, px. key: (1,), of draws."""
 
     F_gt: F8x2
     F_est: F8x2
@@ -76,20 +75,14 @@ def nsgd(
 ) -> Float[Tensor, "*#batch"]:
     """Normalised symmetric geometry distance: each distance divided by the diagonal of the image it is measured in.
 
-    The value is 1 where no draw is accepted, and where a matrix is zero or not finite.
+    The value is at least 0, and 1 where no draw is accepted or a matrix is zero or not finite.
 
     Args:
         F_gt, F_est: true and estimated fundamental matrices (..., 3, 3), of any scale and sign.
         size0, size1: sizes (..., 2) of the images as (h, w).
         samples: accepted draws, of at most ten times as many tries.
-        seed: of the draws.
-        key: (...), the pairs' keys, which select their random points; with the same key and seed the points are the
-            same.
-        cap: limit the mean to 1. Without it the value is a loss, differentiable with respect to both matrices and
-            unbounded.
-
-    Returns:
-        (...), at least 0.
+        seed, key: of all draws, and (...) of each pair; together they select its random points.
+        cap: limit the mean to 1. Without it the value is an unbounded loss, differentiable in both matrices.
 
     Example:
         >>> import torch
@@ -143,8 +136,7 @@ def nsgd_released(
 
     What differs from `nsgd` (github.com/JiawangBian/FM-Bench, ComputeNormlizedSGD.m):
 
-    - the sum over accepted draws is divided by `samples`, however few were accepted among ten times as many tries: an
-      estimate whose lines never meet the image gets 0, perfect;
+    - the sum over accepted draws is divided by `samples`, however few they are: an estimate without any gets 0;
     - the second half exchanges the image sizes together with the matrices, without transposing them;
     - the point on a line is y = -(a x + c) / b: one exactly vertical line among the draws makes the figure 1;
     - virtual points are rounded to whole pixels 0 .. w, 0 .. h, and image borders lie at 0.5 and size + 0.5;
@@ -190,8 +182,7 @@ def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
 @kernel
 def sum_of_draws(pair: Comparison, mixed_seed: int, samples: int, released: bool, out: F8x1) -> None:
     """The sum of the first accepted draws of a pair, and their number -> out (2,).
-    mixed_seed: of the seed and the stream. samples: draws to accept, of 10 x `samples` tries. released: they are those
-    of `nsgd_released`."""
+    mixed_seed: of the seed and the stream. samples: draws to accept, of 10 x as many. released: as `nsgd_released`."""
     state, u, values = stream_state(mixed_seed, pair.key[0]), vector(COLUMNS), vector(BLOCK)
     total, count = 0.0, 0
     for start in range(0, TRIES * samples, BLOCK):

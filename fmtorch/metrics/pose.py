@@ -42,9 +42,8 @@ def pose_error(
         up_to_sign: ignore the sign of t, as SuperGlue (Sarlin et al., CVPR 2020) and LoFTR (Sun et al., CVPR 2021).
 
     Returns:
-        `rotation`, at most 180, and `translation`, at most 90, or 180 with its sign. Where the estimate is not finite
-        both are the largest possible, as is the second where t_est is zero. Where t_gt is zero there is no direction to
-        miss and the second is 0, as in LoFTR.
+        `rotation`, at most 180, and `translation`, at most 90, or 180 with its sign. Both are the largest possible
+        where the estimate is not finite, the second where t_est is zero. Where t_gt is zero it is 0, as in LoFTR.
 
     Example:
         >>> import torch
@@ -92,9 +91,8 @@ def fundamental_pose_error(
         F: estimated fundamental matrices, x1^T F x0 = 0 in pixels.
         K0, K1: calibration matrices.
         x0, x1: the matches whose depths must be positive, usually the estimator's inliers, in pixels.
-        R_gt, t_gt: the true motion, X1 = R X0 + t; the length of t does not count.
+        R_gt, t_gt, up_to_sign: as of `pose_error`.
         mask: which of the matches count; all when not given.
-        up_to_sign: see `pose_error`.
 
     Returns:
         Angles in degrees. Where there is no pose (F without rank 2, a singular calibration, no point in front of both
@@ -133,12 +131,11 @@ def corner_error(
 ) -> Float[Tensor, "*#batch"]:
     """Mean distance in image 1 between the corners of image 0 as two homographies map them (DeTone et al., 2018).
 
+    In pixels, float64; infinite where a corner has no finite image.
+
     Args:
         H_est, H_gt: the estimated and the true homography, x1 ~ H x0 in pixels, of any scale and sign.
         size0: of image 0, (h, w); its corners are the centres of its four corner pixels.
-
-    Returns:
-        Pixels, (...), float64; infinite where a corner has no finite image.
 
     Raises:
         ValueError: a size is not positive.

@@ -22,14 +22,11 @@ BIN = 5  # degrees, as Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019)
 
 @checked
 def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
-    """Share of all pairs with NSGD strictly below the threshold.
+    """Share of all pairs with NSGD strictly below the threshold; NaN where there are no pairs.
 
     Args:
         nsgd: of each pair; NaN, a failure, counts as a miss.
         threshold: in image diagonals, as NSGD.
-
-    Returns:
-        The share, NaN where there are no pairs.
 
     Example:
         >>> import torch
@@ -45,15 +42,11 @@ def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) ->
 def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Mean of `recall` over thresholds from 0 to `maximum`, by default AUC@0.05: the area under its curve, exactly.
 
-    A pair with NSGD e is recalled at the share max(0, 1 - e / maximum) of the thresholds, so this is the mean of that
-    over pairs, and differentiable in e.
+    A pair with NSGD e is recalled at the share max(0, 1 - e / maximum) of the thresholds, of which this is the mean.
 
     Args:
         nsgd: of each pair; NaN counts as a miss.
         maximum: the last threshold, in image diagonals.
-
-    Returns:
-        The area over `maximum`, within [0, 1].
 
     Raises:
         ValueError: `maximum` is not positive.
@@ -67,16 +60,13 @@ def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD)
 def pose_auc(
     errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = THRESHOLDS
 ) -> Float[Tensor, "*batch t"]:
-    """Area under the recall curve of pose errors up to each threshold, divided by the threshold.
+    """Area under the recall curve of pose errors up to each threshold, divided by the threshold: in [0, 1].
 
     As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0.
 
     Args:
         errors: of each pair, in degrees; NaN and infinity count as misses.
         thresholds: in degrees.
-
-    Returns:
-        The area for each threshold, within [0, 1].
 
     Raises:
         ValueError: a threshold is not positive, or there is none.
@@ -115,11 +105,7 @@ def pose_map(
 
     Args:
         errors: of each pair, in degrees, recalled strictly below a bin's end; NaN is a miss.
-        thresholds: in degrees, multiples of `bin`.
-        bin: in degrees.
-
-    Returns:
-        The mean for each threshold, within [0, 1].
+        thresholds, bin: in degrees; thresholds are multiples of `bin`.
 
     Raises:
         ValueError: a threshold is not a positive multiple of the bin, or there is none.
@@ -141,9 +127,6 @@ def pose_maa(errors: Float[Tensor, "*batch pairs"], maximum: int = MAA_MAXIMUM) 
     Args:
         errors: of each pair, in degrees, recalled up to and including a threshold; NaN is a miss.
         maximum: the last threshold, in degrees.
-
-    Returns:
-        The mean, within [0, 1].
 
     Raises:
         ValueError: `maximum` is less than 1.
@@ -171,7 +154,7 @@ DIAGONALS = 0.003  # of the image diagonal (Bian et al., BMVC 2019)
 
 
 class InlierRate(NamedTuple):
-    """Inlier rates of the matches given to the estimator and of those it kept; NaN where there are none."""
+    """Shares of true inliers among the matches given to the estimator and those it kept; NaN where there are none."""
 
     before: Tensor
     after: Tensor
@@ -189,7 +172,7 @@ def inlier_rate(
     mask: Bool[Tensor, "*#batch n"] | None = None,
     threshold: float = DIAGONALS,
 ) -> InlierRate:
-    """Inlier rate before and after estimation: the paper's %Inlier-m and %Inlier as shares.
+    """Inlier rate before and after estimation, float64: the paper's %Inlier-m and %Inlier as shares.
 
     Args:
         F_gt: true fundamental matrices, x1^T F x0 = 0 in pixels.
@@ -198,10 +181,6 @@ def inlier_rate(
         size0, size1: image sizes as (h, w), pixels.
         mask: which of the matches count; all when not given.
         threshold: of `ground_truth_inliers`, in image diagonals.
-
-    Returns:
-        Shares of ground-truth inliers (...), float64: `before`, among the matches in `mask`, and `after`, among those
-        of them that are in `inliers`. NaN where there are none.
 
     Raises:
         ValueError: a size is not positive.
@@ -236,12 +215,11 @@ def ground_truth_inliers(
 ) -> Bool[Tensor, "*#batch n"]:
     """Matches whose two distances to their true epipolar lines are both below `threshold` image diagonals.
 
+    No match is one where F_gt is zero or not finite.
+
     Args:
         F_gt, x0, x1, size0, size1, mask: as of `inlier_rate`.
         threshold: in diagonals of the image in which a distance is measured.
-
-    Returns:
-        (..., N). No match is an inlier where F_gt is zero or not finite.
 
     Raises:
         ValueError: a size is not positive.
@@ -275,12 +253,8 @@ def right_of_homography(
 
     Args:
         H_gt: true homographies, x1 ~ H x0 in pixels.
-        x0, x1: matches in pixels.
-        mask: which of the matches count; all when not given.
+        x0, x1, mask: as of `inlier_rate`.
         threshold: px.
-
-    Returns:
-        (..., N).
     """
     back, forth = homography_transfer(H_gt.to(torch.float64), x0.to(torch.float64), x1.to(torch.float64))
     right = (back + forth) / 2 < threshold

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.failures import in_a_line
-from fmtorch.core.files import claim
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import DataError, ImagePair, ImageSource, read_image
 from fmtorch.geometry import cross_matrix, pose_from_fundamental
@@ -114,8 +113,7 @@ def _pair(
     c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
 ) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
-    Scores are the matcher's, or 1 - ratio, and 1 where there is neither. Raises ValueError for matches that are at no
-    keypoint."""
+    Scores are the matcher's, or 1 - ratio, or 1. Raises ValueError for matches that are at no keypoint."""
     mask = c.mask[0].cpu()
     ends = (x[0].detach().cpu().float()[mask].numpy() for x in (c.x0, c.x1))
     index = [indices(keypoints, x) for keypoints, x in zip(points, ends, strict=True)]
@@ -138,8 +136,7 @@ Pair = tuple[Path, Path]
 
 
 def images_below(folder: Path) -> list[Path]:
-    """The images of a folder, at any depth, by name; none that fmtorch itself has written, nor in hidden folders.
-    Raises ValueError where there are fewer than two."""
+    """A folder's images at any depth, by name; none of fmtorch's or in hidden folders. Raises ValueError below two."""
     if not folder.is_dir():
         raise ValueError(f"images={folder} is no folder")
     images = sorted(_images(folder))
@@ -228,13 +225,6 @@ def default_output(folder: Path) -> Path:
             digest = hashlib.blake2b(str(folder.absolute()).encode(), digest_size=4).hexdigest()
             return output.with_name(f"{output.name}-{digest}")
     return output
-
-
-def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
-    """The folder for what is found of pairs, in `output`; the identity is kept beside it.
-    Raises ValueError where the output holds results of another identity."""
-    claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
-    return output / "export"
 
 
 ROWS = 1024  # of the matrix of similarities that exist at a time

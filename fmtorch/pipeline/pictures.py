@@ -169,7 +169,7 @@ def draw_matches(
     image0: GivenImage, image1: GivenImage, x0: Arrays, x1: Arrays, inliers: Arrays | None = None,
     *, height: int | None = None, most: int = 90, most_bad: int = 50, names: tuple[str, str] | None = None,
 ) -> Image:  # fmt: skip
-    """Two images side by side with their matches as lines, inliers green, others thin and red.
+    """Two images side by side, uint8 RGB (H, W, 3), with their matches as lines: inliers green, others thin and red.
 
     Args:
         image0, image1: files, images of Pillow, or uint8 arrays. Wide ones stand one above the other.
@@ -178,9 +178,6 @@ def draw_matches(
         height: of the picture, px; None: as fits `WIDTH` x `HEIGHT`.
         most, most_bad: lines of each kind at most; where there are more, every part of image 0 shows its fraction.
         names: what inliers and others are called in a line below, which also counts them; None: no such line.
-
-    Returns:
-        The picture, RGB (H, W, 3) of uint8.
 
     Raises:
         ValueError, TypeError: for what is no image, and points or inliers of another shape.
@@ -216,17 +213,13 @@ def draw_epipolar_lines(
 ) -> Image:  # fmt: skip
     """Two images with some of their matches as points and the matches' epipolar lines, ``x1^T F x0 = 0``.
 
-    A match has one colour: its point and the line of its partner in each image.
+    The picture is uint8 RGB (H, W, 3). A match has one colour: its point and the line of its partner in each image.
 
     Args:
-        image0, image1: files, images of Pillow, or uint8 arrays.
-        x0, x1: matched points (N, 2), pixels; give inliers.
+        image0, image1, x0, x1: as of `draw_matches`; give inliers.
         F: (3, 3).
         truth: the true F, whose lines are dashed and white.
         most: matches at most, spread over both images.
-
-    Returns:
-        The picture, RGB (H, W, 3) of uint8.
 
     Raises:
         ValueError, TypeError: for what is no image, no points (N, 2) and no matrix (3, 3).

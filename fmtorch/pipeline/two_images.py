@@ -116,15 +116,12 @@ class MatchResult:
     def save(
         self, folder: Path | str, *, truth: arguments.Arrays | None = None, report: Mapping[str, Any] | None = None
     ) -> list[str]:
-        """Write `result.json` and the pictures into a folder, as `fmtorch match` does.
+        """Write `result.json` and the pictures into a folder, as `fmtorch match` does; the names of the files.
 
         Args:
             folder: made where it is missing.
             truth: as of `draw`.
             report: further entries of `result.json`.
-
-        Returns:
-            The names of the files.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -164,7 +161,7 @@ class MatchResult:
         return report
 
     def __repr__(self) -> str:
-        found = [f"{len(self.inliers)} match{'es' * (len(self.inliers) != 1)}"]
+        found = [files.counted(len(self.inliers), "match")]
         if not self.ok:
             return f"MatchResult({found[0]}, no F: {self.reason})"
         verdict = "related" if self.related else "not related"
@@ -223,8 +220,7 @@ def _plain(value: Tensor | None) -> Any:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Described:
     """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
-    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them. image: reduced,
-    for a matcher that takes the images themselves, and has no features."""
+    seconds: of describing it. pyramid: grey levels, for pruners. image: reduced, for a matcher of images themselves."""
 
     features: Features
     scale: Float[Tensor, " xy"]
@@ -264,11 +260,12 @@ def match(
     focal: arguments.Focal = None,
     lens: arguments.Lens = None,
 ) -> MatchResult:
-    """Match two photographs and estimate their fundamental matrix.
+    """Match two photographs and estimate their fundamental matrix; with K0, K1 or focal also their relative pose.
+
+    Photographs that cannot be related are no error: `related` is False, and mostly `ok` is True, since some F is found.
 
     Args:
-        image0, image1: files, turned as their EXIF orientation says, images of Pillow as they are, or uint8 arrays,
-            (H, W) or RGB (H, W, 3).
+        image0, image1: files, turned as EXIF says, images of Pillow as they are, or uint8 arrays (H, W), RGB (H, W, 3).
         pipeline: a preset of conf/pipeline, or a `Pipeline` (``load_pipeline("sift_gms", overrides=[...])``).
         device: of a pipeline given by name; None: a GPU where there is one.
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
@@ -276,18 +273,12 @@ def match(
         seed: of sampling.
         K0, K1, focal: what is known of the cameras, in pixels of the photographs, as of `find_fundamental`.
         lens: as of `find_fundamental`, of one pair. Features are those of the photographs; matches are undistorted
-            before the estimator where lenses are calibrated, and F relates undistorted points. What is estimated is in
-            `lens`.
-
-    Returns:
-        Matches, F and inliers in pixels of the originals. Photographs that cannot be related are no error: `related` is
-        False, and mostly `ok` is True, since some F is found all the same. With K0, K1 or focal also the pose.
+            before estimation where lenses are calibrated: F relates undistorted points.
 
     Raises:
         ImageError: for a file that is no sound image.
         TypeError: for what is neither a path nor an array.
-        ValueError: for an array of another type or shape, an unknown pipeline, a device that is not there, and for
-            cameras as `find_fundamental`.
+        ValueError: for an array of another type or shape, an unknown pipeline or device, and as `find_fundamental`.
 
     Example:
         >>> import fmtorch, skimage.data

@@ -5,8 +5,7 @@ to a neighbour in image 0 to one in image 1. Where matches are right, neighbours
 frames the pair's common turn and change of scale are found first, so that the images may be rotated and zoomed; then
 each match is compared with its neighbours. That is nearly as telling: `scripts/calibrate_priors.py` has the figures.
 
-Neighbours are taken along space-filling curves instead of by an exact nearest-neighbour query: linear memory, an
-eighth of the time, and the same area under the ROC curve."""
+Neighbours are along space-filling curves: linear memory, an eighth of the time of exact ones, the same ROC area."""
 
 import math
 from collections.abc import Mapping
@@ -41,8 +40,7 @@ MIN_SQUARE32, MIN_VOTES32, ONE32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES)
 
 
 class FramedMatches(NamedTuple):
-    """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
-    ratio: (n,), empty where unknown."""
+    """Matches of a pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), px; mask, ratio (n,), empty: unknown."""
 
     x0: F4x2
     x1: F4x2
@@ -178,8 +176,7 @@ class FrameConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of local affine frames and the ratio.
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no ratio the
-    prior is left as it is. Linear memory: about 700 bytes a match. kernels: worth compiling together with those of an
-    estimator."""
+    prior is left as it is. About 700 bytes a match. kernels: to compile with an estimator's."""
 
     kernels: ClassVar = (frame_prior_kernel, frame_agreement_kernel)
 
@@ -346,8 +343,7 @@ def position_agreement(x0: Points, x1: Points, ratio: PerMatch | None, mask: Boo
 
 class PositionConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio or score.
-    Needs no frames, no sizes and no ratio. Linear memory: about 600 bytes a match. kernels: worth compiling together
-    with those of an estimator."""
+    Needs no frames, sizes or ratio. About 600 bytes a match. kernels: to compile with an estimator's."""
 
     kernels: ClassVar = (position_agreement_kernel, calibrated)
 

@@ -140,8 +140,8 @@ def gms_support_kernel(matches: Matches, sides: I8x1, turns: int, factor: float,
     if len(sides) * turns > 1:
         _, winner = _standing(p0, p1, sides, turns, factor, authors)
     side, turn = sides[winner // turns], winner % turns
-    end, line, table, filled = _ends(p1, side), np.empty(m, np.int64), _table(side), np.empty(CELLS, np.int64)
-    z = np.zeros(m)
+    end, line, filled, z = _ends(p1, side), np.empty(m, np.int64), np.empty(CELLS, np.int64), np.zeros(m)
+    table = np.zeros(CELLS * side * side, np.int32)  # the matches from each cell of image 0 to each of image 1
     for shift in range(4):
         _count(p0, end, shift, side, authors, line, table, filled)
         for i in range(m):
@@ -178,12 +178,6 @@ def _ends(p1: Array, side: int) -> Array:
     for i in range(len(p1)):
         end[i] = np.int64(p1[i, 1] * np.float32(side)) * side + np.int64(p1[i, 0] * np.float32(side))
     return end
-
-
-@inner
-def _table(side: int) -> Array:
-    """Zeros: the matches from each cell of image 0 to each of image 1."""
-    return np.zeros(CELLS * side * side, np.int32)
 
 
 @inner
@@ -234,7 +228,7 @@ def _standing(p0: Array, p1: Array, sides: Array, turns: int, factor: float, aut
     m, largest = len(p0), 0
     for side in sides:
         largest = max(largest, side)
-    bits, table = np.zeros((len(sides), m), np.uint8), _table(largest)
+    bits, table = np.zeros((len(sides), m), np.uint8), np.zeros(CELLS * largest * largest, np.int32)
     line, filled = np.empty(m, np.int64), np.empty(CELLS, np.int64)
     assigned, most, stands = np.empty(CELLS, np.int64), np.empty(CELLS, np.int64), np.empty(CELLS, np.uint8)
     winner, kept_by_winner = 0, -1

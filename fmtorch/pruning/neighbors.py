@@ -286,8 +286,7 @@ def lpm(
     each with its threshold lambda, K and tau: the second seeks neighbours among the matches that the first kept, if
     those are at least K + 4, and decides. Equal to the released code with exact neighbours, ties by index; a neighbour
     that does not exist, where matches are few, counts as lost.
-    Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Computed on the
-    CPU. Raises ValueError for K below 4, and for options of different lengths."""
+    Points in any common unit; not finite ones drop. Linear memory, CPU. ValueError for K < 4 and unequal options."""
     return _kept_and_cost(x0, x1, mask, _passes(thresholds, neighbors, taus))[:, 0] > 0
 
 
@@ -301,8 +300,7 @@ def lpm_cost(
     taus: Sequence[float] = (0.2, 0.2),
 ) -> Float[Tensor, "b n"]:
     """The mean of the costs of the passes of `lpm`, in [0, 1]; 1 for masked matches and non-finite points.
-    The first pass sees all matches, the second those that the first kept: together they tell right matches from wrong
-    ones better than either does. Arguments as `lpm`."""
+    The second pass sees what the first kept: together they tell right from wrong best. Arguments as `lpm`."""
     return _kept_and_cost(x0, x1, mask, _passes(thresholds, neighbors, taus))[:, 1].to(x0.dtype)
 
 

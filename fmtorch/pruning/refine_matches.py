@@ -31,8 +31,7 @@ SAMPLE_PITCH = 3.0  # pixels of a level between samples, at most; half of it whe
 
 class Pyramid(NamedTuple):
     """A grey image at ever coarser scales, as `core.stages.grey_pyramid` makes it.
-    pixels: (sum,), of all levels, row by row. levels: (l, 3), of each its height, its width and where it begins. Point
-    x of the image is at x / 2^l of level l."""
+    pixels: (sum,), of all levels, row by row. levels: (l, 3): height, width, beginning. Point x is at x / 2^l there."""
 
     pixels: U1x1
     levels: I8x2
@@ -242,8 +241,7 @@ def largest_variance(covariance: Array) -> float:
 
 
 class Windows(NamedTuple):
-    """Of each match: points x0, x1 (n, 2), the affine map between their surroundings (n, 2, 2), the distance of the
-    window's samples in image 0 (n,), all in pixels."""
+    """Of each match: points x0, x1 (n, 2), affine map (n, 2, 2), distance of a window's samples in image 0 (n,), px."""
 
     x0: F8x2
     x1: F8x2
@@ -254,8 +252,7 @@ class Windows(NamedTuple):
 class Fit(NamedTuple):
     """How windows are fitted.
     radius: samples from the centre of a window to its sides. iterations: at most. min_correlation: of two windows that
-    show one surface. max_shift: of a point, in samples. max_deviation: of a point in the direction in which it is least
-    exact, in pixels."""
+    show one surface. max_shift: of a point, in samples. max_deviation: px, of a point in its worst direction."""
 
     radius: int
     iterations: int

@@ -133,9 +133,7 @@ class CachedFeatures:
     """An extractor that keeps what another one finds, bit-equal, and computes only what it does not have.
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
-    run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
-    Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
-    `configuration`)."""
+    run. found, computed: images so far. For any number of threads. Raises as `configuration` of the extractor."""
 
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
         self.extractor, self.cache = extractor, cache
@@ -173,11 +171,11 @@ class CachedFeatures:
     def report(self) -> str:
         """One line: what was computed and found so far, and the size of the cache."""
         sizes = [status.st_size for _, status in self.cache.files()]
-        kept = f"{self.cache.folder}: {len(sizes)} file{'s' * (len(sizes) != 1)}, {sum(sizes) / 1e6:.1f} MB"
+        kept = f"{self.cache.folder}: {files.counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB"
         if not self.computed + self.found:  # nothing was to be done, or workers elsewhere did it
             return f"features are kept in {kept}"
         taken = f", of {self.found} taken from the cache" if self.found else ""
-        return f"features of {self.computed} image{'s' * (self.computed != 1)} computed{taken}; {kept}"
+        return f"features of {files.counted(self.computed, 'image')} computed{taken}; {kept}"
 
     def _section(self, name: str, part: object) -> str:
         identity = {"configuration": configuration(part), "environment": environment()}
@@ -202,9 +200,8 @@ class CachedFeatures:
 def cached(
     extractor: FeatureExtractor, cache: str | Path | bool | None, limit: int | float | None = None
 ) -> FeatureExtractor:
-    """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
-    limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
-    it is, with a warning."""
+    """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is. limit:
+    GB, see `ArrayCache`. An extractor without a `configuration` stays as it is, with a warning."""
     if cache is False or str(cache) in OFF or not getattr(extractor, "keep", True):
         return extractor
     folder = files.cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()

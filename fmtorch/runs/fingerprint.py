@@ -29,8 +29,7 @@ GIT_SECONDS = 10  # after which git is taken for absent
 def fmtorch_version() -> str:
     """The version of the code that runs; in a checkout with its commit, and what sources were changed since.
     ``0.1.0`` installed; ``0.1.0+g5c0279c1d2e3`` in a checkout; ``0.1.0+g5c0279c1d2e3.dirty.0f1e2d3c4b5a``, with the
-    digest of the sources, where they are not those of the commit; ``0.1.0+sources.0f1e2d3c4b5a`` where there is no git
-    that tells."""
+    digest of the sources, where they are not those of the commit; ``0.1.0+sources.0f1e2d3c4b5a`` without git."""
     checkout = PACKAGE.parent
     if not (checkout / "pyproject.toml").is_file():
         return __version__
@@ -145,8 +144,7 @@ def configuration(part: object) -> Any:
     A dataclass is its class, its code and the code that it imports from its own package (`code_digest`), and its fields
     (not those with ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields;
     a class is its name and code; a `Path` is the digest of the file; tensors and networks are the digests of their
-    values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be
-    read."""
+    values. Raises TypeError for what does not say what defines it, OSError for a file that cannot be read."""
     return _plain(part, code=True)
 
 

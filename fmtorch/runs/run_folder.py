@@ -207,8 +207,7 @@ class RunFolder:
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> "RunFolder":
         """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
-        Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
-        holds a run of another identity or files that are no run."""
+        For several processes at once. Raises RunFolderError, touching nothing, for another run and for other files."""
         path = Path(path)
         wanted: dict[str, Any] = json.loads(canonical(config))
         if path.exists() and not path.is_dir():
@@ -261,8 +260,7 @@ class RunFolder:
 
     def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:
         """The results, a row of `PAIR_SCHEMA` per pair, without some columns: all, or those of the given keys.
-        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be
-        read."""
+        Of several rows of a pair the first counts. Raises RunFolderError naming a part that cannot be read."""
         names = [name for name in PAIR_SCHEMA.names if name not in without]
         table = pa.concat_tables([PAIR_SCHEMA.empty_table().select(names), *self._parts(names)])
         stored_keys = table["key"].to_numpy()

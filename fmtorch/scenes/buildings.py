@@ -155,8 +155,7 @@ def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
     return np.ascontiguousarray(out * stains[..., None], dtype=np.float32)
 
 
-Rectangle = tuple[float, float, float, float]
-"""Left, lower, right and upper edge on a front, in metres from its foot."""
+Rectangle = tuple[float, float, float, float]  # left, lower, right, upper edge on a front, metres from its foot
 
 
 class Relief(NamedTuple):

@@ -87,8 +87,7 @@ def digest(family: str, split: str, seed: int, plan: Plan) -> str:
 @functools.cache
 def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
     """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
-    Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
-    whose digests are not here, it is judged anew."""
+    Judged once by ``scripts/record_rendered_pairs.py``, and anew with another version of the generator or of OpenCV."""
     return json.loads(RECORD.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
@@ -115,9 +114,8 @@ def draw(scene: DrawnScene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
 
 
 def generate_all(scenes: Sequence[tuple[Task, Path]], workers: int | None, progress: Progress | None) -> None:
-    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
-    workers: processes; None: one for each core that this process may use; 1 draws here. Interrupted, it completes the
-    scenes that are being drawn. Raises WorkersLost where workers die."""
+    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed. workers:
+    processes; None: one a core; 1 draws here. Interrupted, it ends begun scenes. WorkersLost where they die."""
     missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
     report = progress or (lambda done, total: None)
     done = len(scenes) - len(missing)
@@ -258,8 +256,7 @@ class RenderedPairs(HeldPairs):
     split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
     families: some of "indoor", "driving", "orbit", "collection"; all four by default. seed: another seed, other scenes.
     root: the folder that keeps what was drawn, by default ``rendered`` in the cache folder.
-    progress: called with (scenes done, scenes in all). workers: processes that draw, by default one a core.
-    plan: replaces the amounts of `size`, for tests.
+    progress: called with (scenes done, scenes in all). workers: by default one a core. plan: amounts, for tests.
 
     A pair is kept if more than 20 SIFT matches (ratio 0.8) lie within 1 px of the true epipolar lines in both images,
     which is the paper's rule. Raises ValueError for an unknown split, size or family."""
@@ -303,8 +300,7 @@ class RenderedPairs(HeldPairs):
 
     def depth(self, image: ImageSource, points: Matrix) -> Matrix:
         """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
-        The scene is built anew and its rays are cast, as when it was drawn; the last few images are remembered.
-        Raises KeyError for an image of another data set."""
+        The scene is built and cast anew; the last few images are kept. Raises KeyError for another data set's image."""
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 

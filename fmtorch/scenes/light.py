@@ -337,8 +337,7 @@ class Shot:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DrawnScene:
-    """Surfaces (one list for each light: what moves is not in all of them), lights, a sky, shots, candidate pairs.
-    pairs: the pairs to try, most wanted first."""
+    """Surfaces (a list for each light: what moves is not in all), lights, a sky, shots, pairs to try, best first."""
 
     surfaces: Sequence[Surfaces]
     lights: Sequence[Light]

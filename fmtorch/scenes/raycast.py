@@ -214,8 +214,7 @@ class Geometry:
         """What the rays of all pixels of a projection P (3, 4) meet, and G^-1 of every piece, (n, 3, 3).
         P: perspective or (last row 0 0 0 1) orthographic.
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
-        centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
-        skip: pieces (n,) to look through."""
+        centre: of a perspective camera, to leave out backs; None keeps them. skip: pieces (n,) to look through."""
         h, w = size
         G = np.stack([self.U @ P[:, :3].T, self.V @ P[:, :3].T, self.O @ P[:, :3].T + P[:, 3]], axis=2)
         usable = np.abs(np.linalg.det(G)) > 1e-14

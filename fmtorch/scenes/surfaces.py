@@ -35,8 +35,7 @@ def to_pixels(picture: Floats) -> Pixels:
 
 class Texture:
     """A picture (h, w, 3) or, with opacity, (h, w, 4), sRGB in 8 bits; it repeats in both directions.
-    Levels are halved in linear light, so that a surface keeps its brightness with distance; opacity is carried along.
-    Raises ValueError for a picture that cannot be halved."""
+    Levels are halved in linear light, to keep brightness with distance. Raises ValueError where that is impossible."""
 
     def __init__(self, picture: Pixels) -> None:
         h, w = picture.shape[:2]

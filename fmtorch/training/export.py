@@ -1,7 +1,6 @@
 """How good a pruner is, through real estimators on whole pairs; and what its training leaves.
 
-That is the network as safetensors and ONNX, which state the network that they belong to, and a card that says where it
-comes from and how good it is."""
+That is the network as safetensors and ONNX, which state it, and a card: where it comes from, how good it is."""
 
 import contextlib
 import copy
@@ -177,14 +176,11 @@ def temperature(logit: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"
 
 
 def reliability(probability: Float[Tensor, "*matches"], label: Int8[Tensor, "*matches"]) -> Reliability:
-    """Predicted probabilities against observed shares of inliers.
+    """Predicted probabilities against observed shares of inliers, float64; a probability of 1 is in the last of `BINS`.
 
     Args:
         probability: that a match is an inlier, of any shape.
         label: 1 inlier, 0 outlier, -1 ignored.
-
-    Returns:
-        The table and the expected calibration error, float64; a probability of 1 falls in the last of `BINS`.
     """
     labelled = label >= 0
     p = probability.detach()[labelled].to(torch.float64)
@@ -303,8 +299,7 @@ def write_result(
 ) -> tuple[list[Path], dict[str, float]]:
     """Evaluate the best weights of a training and write them into its folder; the files, and the figures.
     The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
-    installed, .onnx. facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`,
-    the identity."""
+    installed, .onnx. facts of the training: `data`, `seconds`, `steps`, `best_step`, `processor`, the identity."""
     network = network.to("cpu").eval()
     evaluation = validation(network)
     fitted = temperature(evaluation.logit, evaluation.label)

@@ -37,8 +37,7 @@ OUTLIER_PX = 6.0  # smallest error of an outlier, pixels
 EDGE_PX = 1.0  # a keypoint on an edge of depth may belong to what is so many pixels beside it
 VERSION = 1  # of these rules, part of a store's identity
 
-Rule = Literal["pixels", "geodesic"]
-"""What labels go by: errors in pixels, or OANet's geodesic distance in calibrated coordinates."""
+Rule = Literal["pixels", "geodesic"]  # labels by errors in pixels, or by OANet's geodesic distance
 Points = NDArray[np.float64]
 Labels = NDArray[np.int8]
 _AROUND = EDGE_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -96,8 +95,7 @@ class LabelledMatches(records.Record):
 
 
 def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
-    """One padded batch from several: for torch's DataLoader. Optional fields survive only where every item has them.
-    Raises ValueError for an empty list."""
+    """One padded batch from several, with the optional fields that all have. Raises ValueError for an empty list."""
     c = types.collate([item.correspondences for item in items])
     n = c.x0.shape[1]
     label = torch.cat([_padded(item.label, n) for item in items])
@@ -183,9 +181,8 @@ class Augmentation(AugmentationOptions):
     def __call__(
         self, matches: LabelledMatches, *, seed: int, epoch: int = 0, count: int | None = None
     ) -> LabelledMatches:
-        """The matches of one pair, a batch of one, changed; at most `count` of them, in place of a random number.
-        seed, epoch: select the random numbers, with the pair's key. Raises ValueError for a batch of several pairs:
-        their numbers of matches would differ."""
+        """The matches of one pair, a batch of one, changed; at most `count` of them, in place of a random number. seed,
+        epoch: with the pair's key select the random numbers. Raises ValueError for a batch of several pairs."""
         if len(matches) != 1:
             raise ValueError(f"an augmentation changes one pair at a time, not a batch of {len(matches)}")
         key = matches.correspondences.keys.cpu()
@@ -363,8 +360,7 @@ def crop(matches: LabelledMatches, image: int, box: tuple[int, int, int, int]) -
 
 
 def keep_ratio(matches: LabelledMatches, threshold: float | int) -> LabelledMatches:
-    """The matches whose `ratio`, the ratio of the distances to the two nearest descriptors, is below `threshold`.
-    A threshold of 1 keeps all. Raises ValueError for matches without `ratio`."""
+    """The matches whose `ratio` is below `threshold`; 1 keeps all. Raises ValueError for matches without `ratio`."""
     ratio = matches.correspondences.ratio
     if ratio is None:
         raise ValueError("a ratio threshold needs `ratio`: the nearest-neighbour distance ratio of each match")

@@ -39,8 +39,7 @@ class MatchedPairs(StoredMatches):
     Matches are computed once, by `workers` threads, and kept on disk; an interrupted computation goes on where it
     stopped, a damaged file is computed anew. The folder's name holds a digest of all that defines them: data set,
     stages before estimation, label rules, libraries. Pairs come ordered by family, scene and images. A pipeline without
-    a ratio test leaves the threshold to the `augmentation`. Several processes may compute the same folder at once: each
-    does all that is missing when it starts, and they agree.
+    a ratio test leaves the threshold to the `augmentation`. Several processes may compute one folder at once.
 
     Args:
         dataset: image pairs with ground truth; labels are by depth where it is a `DepthDataset`.
@@ -49,12 +48,10 @@ class MatchedPairs(StoredMatches):
         root: the folder of such folders, by default ``matched`` in the cache folder.
         workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
         augmentation, seed: as of `StoredMatches`.
-        execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
-            an object; pickled, as is the data set.
+        execution: other workers. build: makes a pipeline given as an object in other processes; pickled, as `dataset`.
         labels: pixels: by depth or the epipolar lines; geodesic: OANet's, for which the cameras must be known.
 
-    Raises ValueError for an unknown pipeline, for one whose stages do not say what defines their results, for an empty
-    data set, and where every pair fails.
+    Raises ValueError for an unknown pipeline, stages without a `configuration`, no pairs, and where every pair fails.
 
     Example:
         >>> from fmtorch.data import load

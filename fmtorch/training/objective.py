@@ -16,6 +16,7 @@ from fmtorch.jit.kernel import F8x1, F8x2, I8x1, for_each_pair, kernel
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 from fmtorch.metrics import nsgd
 from fmtorch.metrics.nsgd import BORDER, line_of, segment_in_image
+from fmtorch.pruning.networks.architectures import by_calibration
 from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.options import ObjectiveWeights
@@ -121,9 +122,6 @@ def geometric_loss(
         points: virtual points for each pair.
         seed, key: the pairs' keys, which select their virtual points.
 
-    Returns:
-        The loss, between 0 and the limit.
-
     Raises:
         ValueError: only one of K0 and K1 is given, or points is less than 1.
     """
@@ -139,7 +137,7 @@ def geometric_loss(
     valid = _valid_models(F_est, valid)
     F = epipolar.unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
     F = epipolar.unit_largest(arithmetic.matmul3(arithmetic.matmul3(A1.mT, F), A0))
-    e, squared0, squared1 = epipolar.residual_and_normals(F, _normalised(x0, A0), _normalised(x1, A1))
+    e, squared0, squared1 = epipolar.residual_and_normals(F, by_calibration(x0, A0), by_calibration(x1, A1))
     floor = NORMAL_FLOOR**2
     squared = e * e * (1 / (squared0 + floor) + 1 / (squared1 + floor))
     count = mask.sum(-1)
@@ -159,19 +157,15 @@ def nsgd_loss(
     seed: int = 0,
     key: Int[Tensor, " b"] | None = None,
 ) -> Float[Tensor, ""]:
-    """The benchmark's own figure as a loss: NSGD without its cap (`fmtorch.metrics.nsgd`), mean over pairs and stages.
+    """The benchmark's own figure as a loss: `fmtorch.metrics.nsgd` without its cap, the mean over pairs and stages.
 
-    A pair none of whose draws is accepted, since the lines of one matrix miss the image, counts 1 and has no gradient:
-    train with another loss beside this one.
+    A pair without an accepted draw (lines miss the image) counts 1 without gradient: train with another loss, too.
 
     Args:
         F_est, F_true, size0, size1, valid: as of `geometric_loss`.
         limit: clamp of a pair's figure, in image diagonals, beyond which it has no gradient; None: no clamp.
         samples: accepted draws for each pair.
         seed, key: the pairs' keys, which select their draws.
-
-    Returns:
-        The loss in image diagonals.
 
     Raises:
         ValueError: samples is less than 1.
@@ -202,8 +196,7 @@ def virtual_points(
         F: true fundamental matrices in pixels, of any scale.
         size0, size1: image sizes as (h, w), pixels.
         count: points for each pair.
-        seed: of the draws, a function of (seed, key).
-        key: the pairs' keys; 0 for all where None.
+        seed, key: of the draws; the pairs' keys, 0 for all where None.
 
     Returns:
         Points x0, x1 in pixels and a mask, `count` slots for each pair, (0, 0) where masked. There are fewer points
@@ -225,8 +218,7 @@ def virtual_points(
 
 @kernel
 def points_on_lines(F: F8x2, size0: F8x1, size1: F8x1, key: I8x1, mixed_seed: int, out: F8x2) -> None:
-    """The `virtual_points` of a pair, x0, y0, x1, y1, 1 -> out (count, 5); 0 past the last.
-    mixed_seed: of the seed and the stream."""
+    """The `virtual_points` of a pair, x0, y0, x1, y1, 1 -> out (count, 5); 0 past the last."""
     state, count = stream_state(mixed_seed, key[0]), 0
     out[:] = 0
     for draw in range(TRIES * len(out)):
@@ -261,9 +253,3 @@ def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
     half = torch.maximum(h, w) / 2
     zero, ones = torch.zeros_like(h), torch.ones_like(h)
     return torch.stack([half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones], -1).reshape(-1, 3, 3)
-
-
-def _normalised(x: Float[Tensor, "b n 2"], A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:
-    """The points A^-1 x, of an upper triangular A with last row (0, 0, 1)."""
-    y = (x[..., 1] - A[:, 1, 2, None]) / A[:, 1, 1, None]
-    return torch.stack([(x[..., 0] - A[:, 0, 2, None] - A[:, 0, 1, None] * y) / A[:, 0, 0, None], y], -1)

@@ -44,8 +44,7 @@ def list_photographs(
     """The photographs of a folder, in a fixed order.
     The source is the fourth column of ``sources.txt`` (file width height source path) where the folder has one, with
     the path appended after a colon for `excluded`; else the subfolder, or for files at the top the file itself.
-    sources: only these; None: all. excluded: parts of "source:path" that are left out. Raises FileNotFoundError where
-    the folder is absent, ValueError where nothing is left."""
+    sources: only these; None: all. excluded: parts of "source:path". Raises FileNotFoundError, ValueError for none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder of photographs")
@@ -71,8 +70,7 @@ class PlanePairs(HeldPairs):
     are changed as by another camera on another day. Views are drawn on first use and kept; a view depends on its
     photograph's bytes, `views`, `seed` and its number alone. photographs: files that OpenCV reads. root: folder that
     keeps the views, by default ``planes`` in the cache folder. workers: threads that draw. progress: called with
-    (photographs done, photographs in all). Raises ImageError for a file that is no image, ValueError where there is
-    none."""
+    (photographs done, photographs in all). Raises ImageError for a file that is none."""
 
     name = "planes"
 

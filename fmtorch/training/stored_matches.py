@@ -22,13 +22,12 @@ from fmtorch.training.labelled import Augmentation, LabelledMatches, collate, su
 PATTERN = "shard-*.arrow"
 FORMAT = 1  # of the files; raised when the schema changes
 
-ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {  # of a pair: types and shapes, -1: number of its matches
     **dict.fromkeys(("F", "K0", "K1"), ("float64", (3, 3))), **dict.fromkeys(("size0", "size1"), ("int64", (2,))),
     **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
     **dict.fromkeys(("ratio", "score", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
     **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
-"""What is stored of a pair and of its matches: types of the numbers, and shapes, -1 for the number of matches."""
 _TEXTS, _COUNTS = ("identity", "family", "scene", "reason"), ("matches", "inliers", "outliers")
 INDEX = {"key": pa.int64(), **dict.fromkeys(_TEXTS, pa.string()), **dict.fromkeys(_COUNTS, pa.int64())}
 """What is known of a pair without its matches, and types."""
@@ -51,8 +50,7 @@ def write_shard(path: Path, rows: Sequence[Row]) -> None:
 
 class Shard:
     """A file of matches, mapped into memory: reading a pair touches the bytes of that pair only.
-    verify: check every byte against the checksum, at about 1 GB/s. Raises ShardError for a file that is missing,
-    damaged or of another version."""
+    verify: check the checksum, at about 1 GB/s. Raises ShardError for a missing or damaged file or another version."""
 
     def __init__(self, path: Path, *, verify: bool = False) -> None:
         self.path = path
@@ -113,13 +111,11 @@ class StoredMatches(Dataset[LabelledMatches]):
 
     Files are mapped into memory and opened by each process for itself, so the data set can be handed to the workers of
     a DataLoader, forked or spawned. Pairs that failed are left out, with a warning; `failures` holds their identities
-    and reasons. `pairs` says of each item what its key, identity, family and scene are, and how many matches, inliers
-    and outliers it has on disk.
+    and reasons. `pairs` has of each item the columns of `INDEX`.
 
     Args:
         folder: holds ``shard-*.arrow``.
-        augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
-            index that is a `Draw`).
+        augmentation: random changes of each item, by `seed`, the pair's key and the epoch (`set_epoch`, or a `Draw`).
 
     Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file."""
 
@@ -230,8 +226,7 @@ class StoredMatches(Dataset[LabelledMatches]):
 def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, StoredMatches]:
     """Pairs for training, and those of the last scenes of each family, by name, for validation.
 
-    The splits of a data set share neither scene nor pair. The rendered training scenes share a few photographs, which
-    hang on walls of both parts.
+    The splits share neither scene nor pair; of rendered training scenes they share a few photographs on walls.
 
     Args:
         matches: of several scenes a family. last: scenes of each family for validation.
@@ -273,14 +268,12 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
     Pairs are shuffled, sorted by length within pools of a few batches, and the batches shuffled. Every batch draws one
     number of matches that its pairs are cut to, so that padding is due to shorter pairs only; `collate_trimmed` bounds
     it. All is a function of (seed, epoch): after `set_epoch` the batches are those of an uninterrupted training, and
-    `start` leaves out those that it has seen. The epoch travels with each item, so that workers of a DataLoader, also
-    persistent ones, need not be told.
+    `start` leaves out those that it has seen. The epoch travels with each item, for workers of a DataLoader.
 
     Args:
         dataset: `MatchedPairs`. batch: pairs in a batch; the last one of an epoch may be smaller.
         seed: selects the batches. matches: range of the number of matches, uniform in its logarithm; None: no limit.
-        rank, world_size: of this process in a distributed training; each has as many batches, where need be some of
-            the first ones twice.
+        rank, world_size: in a distributed training; each has as many batches, where need be some of the first twice.
 
     Raises ValueError for a batch below 1, and for a rank that is not below world_size."""
 
@@ -327,8 +320,7 @@ class SimilarLengthBatches(Sampler[list[Draw]]):
 
 def collate_trimmed(items: Sequence[LabelledMatches], padding: float = MAX_PADDING) -> LabelledMatches:
     """`collate`, with the longest pairs cut so that at most `padding` of all slots are padding.
-    The first matches of a pair are kept, a random subset of those that an `Augmentation` gives. Raises ValueError for
-    an empty list."""
+    The first matches of a pair are kept, a random subset after an `Augmentation`. Raises ValueError as it does."""
     n = longest(torch.tensor([int(item.correspondences.mask.sum()) for item in items]), padding)
     return collate([item.compact().first(n) for item in items])
 

@@ -156,7 +156,6 @@ def test_damaged_depth_is_named(content: bytes, message: str, tmp_path: Path) ->
     maps.mkdir(parents=True)
     (maps / "00.png.geometric.bin").write_bytes(content)
     dataset = load("colmap", root=tmp_path, sequences=["scene"], pairs=None)
-    assert isinstance(dataset, DepthDataset)
     image = next(image for pair in dataset for image in (pair.image0, pair.image1) if image.path.name == "00.png")
     with pytest.raises(ImageError, match=rf"00\.png\.geometric\.bin: .*{message}"):
         dataset.depth(image, np.zeros((1, 2)))

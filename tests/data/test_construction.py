@@ -19,11 +19,10 @@ from fmtorch.scenes import Plan, RenderedPairs
 from fmtorch.training import OANetPairs
 from tests.conftest import shared_path
 from tests.data.native import write_colmap, write_image, write_kitti
-from tests.helpers import apart, call_command
+from tests.helpers import apart, call_command, write_file
 from tests.reference import labels as reference
 
 RANGE = "it must be a list, each a number from 0 to 1: least and greatest"
-PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.1)
 COLMAP = ("count=null", "workers=1", "dataset=colmap", "dataset.sequences=[a]")
 THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
 
@@ -92,8 +91,7 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(scenes, tmp_pa
 
 
 def test_a_finished_set_is_not_made_again_and_another_is_refused(scenes, tmp_path, monkeypatch, capsys):
-    (tmp_path / "Made").mkdir()
-    (tmp_path / "Made/notes.txt").write_text("mine")
+    write_file(tmp_path / "Made/notes.txt", "mine")
     with pytest.raises(SystemExit, match=r"error: Made is not empty and has no pairs\.json, .*; name another folder"):
         run(tmp_path, monkeypatch, "count=1")
     (tmp_path / "Made/notes.txt").unlink()
@@ -200,8 +198,8 @@ def test_matches_take_the_place_of_images_in_oanets_layout(scenes, tmp_path, mon
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> ScenePairs:
     """All pairs of four photographs each of two families; cameras of the collection have other sizes."""
     root = tmp_path_factory.mktemp("rendered")
-    families = ["indoor", "collection"]
-    return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
+    families, plan = ["indoor", "collection"], Plan(scenes=1, shots=4, pairs=4, scale=0.1)
+    return RenderedPairs(families=families, root=root, plan=plan, workers=1).scene_pairs()
 
 
 def one_by_one(dataset: ScenePairs, scene: int, i: int, j: int) -> float:

@@ -70,17 +70,16 @@ def test_a_missing_image_or_a_car_that_stands_still_is_a_problem_of_its_pairs_al
 
 
 def test_missing_sequences_and_roots_are_told(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="kitti needs root: the folder with sequences/ and poses/"):
-        load("kitti")
-    with pytest.raises(DataError, match="sequences: no such folder; it must hold a folder for each sequence"):
-        load("kitti", root=tmp_path)
-    root = write_kitti(tmp_path)
-    with pytest.raises(DataError, match=r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes"):
-        load("kitti", root=root)
-    with pytest.raises(DataError, match="split 'validation'; there are test and train"):
-        load("kitti", split="validation", root=root)
-    with pytest.raises(DataError, match="one is named twice"):
-        load("kitti", root=root, sequences=["06", "06"])
+    root = write_kitti(tmp_path / "KITTI")
+    for options, said in (
+        ({}, "kitti needs root: the folder with sequences/ and poses/"),
+        ({"root": tmp_path}, "sequences: no such folder; it must hold a folder for each sequence"),
+        ({"root": root}, r"no sequence '07'; there are: 06\. dataset\.sequences=\[\.\.\.\] takes"),
+        ({"root": root, "split": "validation"}, "split 'validation'; there are test and train"),
+        ({"root": root, "sequences": ["06", "06"]}, "one is named twice"),
+    ):
+        with pytest.raises(DataError, match=said):
+            load("kitti", **options)
 
 
 NAME = "rgbd_dataset_freiburg1_test"

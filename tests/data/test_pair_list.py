@@ -15,12 +15,9 @@ import pytest
 from fmtorch.data import DataError, NpzArrays, load, read_image
 from tests.data import lists
 from tests.helpers import apart, cross_matrix
+from tests.reference.solvers import unit
 
 PAIRS = ((0, 1), (2, 3), (1, 5))
-
-
-def unit(F: np.ndarray) -> np.ndarray:
-    return F / np.linalg.norm(F)
 
 
 FORMS: dict[str, Callable[[Path], list[str]]] = {

@@ -26,10 +26,9 @@ from fmtorch.data import read_image
 from scripts.benchmark.methods import read_specs
 from tests.conftest import own_cache
 from tests.io import writers
-from tests.processes import run_command
+from tests.processes import SOURCE, run_command
 from tests.verification import databases, test_matches
 
-SOURCE = Path(__file__).resolve().parents[2]
 GUIDES = [path.relative_to(SOURCE).as_posix() for path in sorted((SOURCE / "docs").rglob("*.md"))]
 PAGES = ["README.md", "CONTRIBUTING.md", *GUIDES]
 SETS = {"PhotoTourism": "a", "KITTI": "a", "TUM": "a", "Strecha": "ab", "Strecha_train": "ab", "TanksLike": "ab"}
@@ -175,16 +174,15 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         line = f"0 1 {' '.join(map(str, F.ravel()))}\n"
         (folder / "DATA" / name / "pairs_with_gt.txt").write_text(line * len(scenes))
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
+    (folder / "PHOTOS").mkdir()
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
-        cv2.imwrite(str(folder / name), image[..., ::-1])
+        for place in (folder, folder / "PHOTOS"):
+            cv2.imwrite(str(place / name), image[..., ::-1])
     for training in ("S1", "S2", "C", "N", "P500", "P1500", "PLANES"):
         (folder / training).mkdir()
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PLANES_SIDE").mkdir()
     shutil.copy(SOURCE / "models" / "lc_side.safetensors", folder / "PLANES_SIDE")
-    for name in ("a.jpg", "b.jpg"):
-        (folder / "PHOTOS").mkdir(exist_ok=True)
-        shutil.copy(folder / name, folder / "PHOTOS")
     (folder / "list.txt").write_text("a.jpg b.jpg\n")
     for layout in ("posebench", "hloc", "oanet"):
         writers.WRITERS[layout](folder / "FILES" / layout)
@@ -240,16 +238,21 @@ def is_of(command: str, patterns: Iterable[str]) -> bool:
     return any(re.search(pattern, command) for pattern in patterns)
 
 
-def parameters(slow: bool) -> list[object]:
-    here = {page: [c for c in commands(page) if not is_of(c, ELSEWHERE) and is_of(c, SLOW) == slow] for page in PAGES}
-    return [pytest.param(page_commands, id=page) for page, page_commands in here.items() if page_commands]
+def parameters() -> Iterator[object]:
+    """The commands of each page, and apart those that take long."""
+    for word, marks in (("", ()), ("slow ", (pytest.mark.slow,))):
+        for page in PAGES:
+            here = [c for c in commands(page) if not is_of(c, ELSEWHERE) and is_of(c, SLOW) == bool(word)]
+            if here:
+                yield pytest.param(here, id=f"{word}{page}", marks=marks)
 
 
 RUN: list[list[str]] = []
 """What has been run; a command that stands on several pages is run once."""
 
 
-def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page_commands", parameters())
+def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in page_commands:
         print(command)
@@ -259,17 +262,6 @@ def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.Monke
         if words not in RUN:
             run(words, workplace)
             RUN.append(words)
-
-
-@pytest.mark.parametrize("page_commands", parameters(slow=False))
-def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_all(page_commands, workplace, monkeypatch)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("page_commands", parameters(slow=True))
-def test_the_long_commands_of_a_page_run(page_commands, workplace, monkeypatch):
-    run_all(page_commands, workplace, monkeypatch)
 
 
 @pytest.mark.parametrize("page", PAGES)

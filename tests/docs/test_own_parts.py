@@ -17,10 +17,10 @@ import torch
 from fmtorch import data, find_fundamental
 from fmtorch.scenes import FAMILIES, Plan
 from tests.conftest import own_cache
+from tests.helpers import write_file
 from tests.laws import scene
-from tests.processes import run_command
+from tests.processes import SOURCE, run_command
 
-SOURCE = Path(__file__).resolve().parents[2]
 PAGE = (SOURCE / "docs" / "guides" / "own_parts.md").read_text(encoding="utf-8")
 
 
@@ -28,8 +28,7 @@ PAGE = (SOURCE / "docs" / "guides" / "own_parts.md").read_text(encoding="utf-8")
 def folder(tmp_path: Path) -> Path:
     """The page's files, and the photographs and pairs that it leaves to the reader."""
     for name, content in re.findall(r"```(?:python|yaml)\n# (\S+)\n(.*?)```", PAGE, flags=re.DOTALL):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(content)
+        write_file(tmp_path / name, content)
     pair = data.load("stereo")[0]
     for name, source in (("left.png", pair.image0), ("right.png", pair.image1)):
         shutil.copyfile(source.path, tmp_path / name)
@@ -66,7 +65,7 @@ def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pyt
     assert int(estimate.inliers.sum()) > 180  # of 210
 
 
-NOTEBOOKS = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
+NOTEBOOKS = SOURCE / "docs" / "notebooks"
 SMALL = Plan(scenes=2, shots=4, pairs=4, scale=0.3)
 
 

@@ -228,9 +228,6 @@ def test_features_are_computed_while_kernels_are_compiled(tmp_path: Path, monkey
     assert sum("absent.png" in row.reason for row in rows) == 1
 
 
-GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
-
-
 @dataclasses.dataclass(frozen=True)
 class Learned:
     """A stage of any kind that says which file it was learned from."""
@@ -297,9 +294,7 @@ def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
             presets.build("features", "rootsiftpca"), Learned(files["matcher"]), pruners,  # type: ignore[arg-type]
             presets.instantiate(estimator, "estimator"),
         )  # fmt: skip
-        digests = identity(pipeline=parts, estimator=estimator)["learned"]
-        assert isinstance(digests, dict)
-        return digests
+        return identity(pipeline=parts, estimator=estimator)["learned"]  # type: ignore[return-value]
 
     before = learned()
     assert {group: len(digests) for group, digests in before.items()} == {
@@ -313,7 +308,7 @@ def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
         before = now
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", ["features", "matcher", "pruner", "estimator", "dataset"])
 def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert identity()["code"] == {}
     own = {"_target_": f"{__name__}.Learned", "model": "x"}

@@ -97,9 +97,8 @@ def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_est
         assert folded.translation_error == pytest.approx(0, abs=0.1)
         assert row.rotation_error == folded.rotation_error
     failed = dataclasses.replace(outcomes[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
-    nothing = dataclasses.replace(
-        outcomes[1], estimate=outcomes[1].estimate.replace(matrix=torch.zeros(1, 3, 3).double())
-    )
+    zero = outcomes[1].estimate.replace(matrix=torch.zeros(1, 3, 3).double())
+    nothing = dataclasses.replace(outcomes[1], estimate=zero)
     rows = evaluation.evaluate([failed, nothing], signed=True)
     assert [(row.rotation_error, row.translation_error) for row in rows] == [(180.0, 180.0)] * 2
     assert [row.pose_reason for row in rows] == ["no F", "F has no pose"]

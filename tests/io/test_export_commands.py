@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from omegaconf import DictConfig
 from PIL import ExifTags, Image
 
@@ -23,12 +22,12 @@ from fmtorch.commands import match as match_command
 from fmtorch.data import Lens, load, read_image
 from fmtorch.io import DATABASE
 from fmtorch.io.export import FEATURES, MATCHES
-from fmtorch.metrics import pose_error
 from fmtorch.pipeline import chosen_pairs, images_below
 from fmtorch.runs import RunFolder
 from tests.commands.test_match import BENT, photographed
 from tests.conftest import shared_path
 from tests.helpers import call_command, compose, draw, draw_set
+from tests.reference.known_cameras import pose_error
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
@@ -200,9 +199,6 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path, monkeypatch: pytest.Monk
         run("none", *words, "pruner=[]", "export=h5")
 
 
-SIDE = 768  # px
-
-
 class Scene:
     """The first pair of castle-P19 at half its size, as photographs of a lens with distortion if so asked."""
 
@@ -223,13 +219,8 @@ class Scene:
             Image.fromarray(image).save(folder / name, quality=97, exif=exif)
 
     def match(self, output: Path, *words: str) -> Path:
-        given = (f"images={self.folder}", f"output={output}", f"longest_side={SIDE}", "cache=off", *words)
+        given = (f"images={self.folder}", f"output={output}", "longest_side=768", "cache=off", *words)
         return match_command.run(compose("match", ("pipeline=sift_fmtorch", *given)), "sift_fmtorch")
-
-    def error(self, R: np.ndarray, t: np.ndarray) -> float:
-        """The larger angle of the pose error, with the sign of t, in degrees."""
-        given = (torch.from_numpy(np.array(v, np.float64))[None] for v in (R, t, self.pair.R, self.pair.t))
-        return float(pose_error(*given, up_to_sign=False).worst)
 
 
 def stored(folder: Path) -> tuple[Any, Any]:
@@ -251,7 +242,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.calibration_matrix(), scene.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
     assert kind(geometry) == "CALIBRATED"
     pose = geometry.cam2_from_cam1
-    assert scene.error(pose.rotation.matrix(), pose.translation) < 0.5
+    assert pose_error(pose.rotation.matrix(), pose.translation, scene.pair) < 0.5
     with h5py.File(output / MATCHES) as file:
         attributes = dict(file["a.jpg/b.jpg"].attrs)
     np.testing.assert_allclose(attributes["R"], pose.rotation.matrix(), atol=1e-9)
@@ -284,7 +275,7 @@ def test_a_file_of_a_lens(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.params, [float(word) for word in parameters.split()])
     assert kind(geometry) == "CALIBRATED"
     pose = geometry.cam2_from_cam1
-    assert scene.error(pose.rotation.matrix(), pose.translation) < 0.6
+    assert pose_error(pose.rotation.matrix(), pose.translation, scene.pair) < 0.6
     with pycolmap.Database.open(output / DATABASE) as file:
         x = [file.read_keypoints(i)[:, :2][geometry.inlier_matches[:, k]] for k, i in ((0, 1), (1, 2))]
     rays = [np.column_stack([camera.cam_from_img(p.astype(np.float64)), np.ones(len(p))]) for p in x]
@@ -306,7 +297,7 @@ def test_focal_lengths_by_exif_and_shared_ones(tmp_path: Path) -> None:
     assert camera.has_prior_focal_length
     assert (camera.focal_length, kind(geometry)) == (pytest.approx(focal), "CALIBRATED")
     pose = geometry.cam2_from_cam1
-    assert scene.error(pose.rotation.matrix(), pose.translation) < 3
+    assert pose_error(pose.rotation.matrix(), pose.translation, scene.pair) < 3
     output = scene.match(tmp_path / "shared", "cameras=shared", "export=colmap")
     with pycolmap.Database.open(output / DATABASE) as file:
         assert file.num_cameras() == 1

@@ -17,7 +17,8 @@ from fmtorch.jit import cache as files
 from fmtorch.jit import kernel as switch
 from fmtorch.jit.kernel import Kernel, kernel
 from fmtorch.jit.lanes import fused
-from tests.helpers import in_threads
+from tests.helpers import full_disk, in_threads, write_file
+from tests.processes import SOURCE as SOURCE_TREE
 from tests.processes import run_command, starter
 
 SOURCE = """
@@ -53,7 +54,6 @@ def answered(flags: I8x1, rounds: int):
         np.empty(1)  # as far as the compiler knows, this may change the flags
     return False
 """
-REPOSITORY = Path(__file__).resolve().parents[2]
 numba = pytest.importorskip("numba", reason="numba is not installed")
 EXPECTED = [[2, 8], [18, 32]]
 
@@ -89,10 +89,6 @@ def result(module: types.ModuleType) -> list[list[float]]:
     out = np.zeros_like(x)
     module.rows(x, out)
     return out.tolist()
-
-
-def refused(*_: object, **options: object) -> int:
-    raise OSError("no space left on device")
 
 
 RETURNING = """
@@ -159,7 +155,7 @@ def test_two_processes_compile_together(module, tmp_path, monkeypatch, cache, im
 
 def start_helper(folder: Path, kernel: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "fmtorch.jit.kernel", kernel]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(folder)])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCE_TREE), str(folder)])}
     return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)
 
 
@@ -236,9 +232,8 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
     result(load(tmp_path))
     capsys.readouterr()
     files.folder.cache_clear()
-
-    monkeypatch.setattr(Path, "write_text", refused)
-    monkeypatch.setattr(Path, "write_bytes", refused)
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
     assert files.folder() is not None
     monkeypatch.undo()
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
@@ -246,16 +241,15 @@ def test_a_cache_that_can_only_be_read_is_used(tmp_path, monkeypatch, capsys):
 
 
 def test_a_full_disk_costs_the_file_and_not_the_result(module, cache, monkeypatch):
-    monkeypatch.setattr(Path, "write_bytes", refused)
-    with pytest.warns(UserWarning, match="no space left"):
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
+    with pytest.warns(UserWarning, match="No space left"):
         assert result(module) == EXPECTED
     assert not list(cache.rglob("*.bin*"))
 
 
 def test_folders_long_unused_are_removed(cache: Path) -> None:
     for name, days in (("old", 31), ("recent", 29)):
-        (cache / name).mkdir(parents=True)
-        (cache / name / files.ABOUT).write_text("{}")
+        write_file(cache / name / files.ABOUT, "{}")
         then = time.time() - days * 24 * 3600
         os.utime(cache / name / files.ABOUT, (then, then))
     (cache / "of somebody else").mkdir()
@@ -289,8 +283,7 @@ def test_a_kernel_may_keep_the_lock_that_others_leave_to_other_threads(tmp_path:
 
 def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path) -> None:
     here = tmp_path / "here"
-    here.mkdir()
-    (here / "some_kernels.py").write_text(SOURCE)
+    write_file(here / "some_kernels.py", SOURCE)
     code = (
         "import numpy as np, some_kernels as k\n"
         "from fmtorch.jit.cache import KernelFile\n"

@@ -82,8 +82,6 @@ def test_float32_stays_float32() -> None:
 
 
 def test_lanes_of_different_kinds_do_not_mix() -> None:
-    import numba
-
     @kernel
     def mixed(a: F8x2, b: F4x2):
         store(a, 0, load(a, 0) + load_singles(b, 0))

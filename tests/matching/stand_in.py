@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import write_file
+
 PACKAGE = '''
 import cv2, numpy as np, torch
 available_models = ["sift-nn", "superpoint-lightglue", "silent", "broken", "no-download", "random", "uneven", "romav2"]
@@ -85,11 +87,8 @@ def get_matcher(matcher_name="sift-nn", device="cpu", max_num_keypoints=2048, **
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Put the package before all others; it is gone after the test."""
-    package = folder / "vismatch"
-    package.mkdir()
-    (package / "__init__.py").write_text(PACKAGE)
-    (folder / "vismatch-9.9.dist-info").mkdir()
-    (folder / "vismatch-9.9.dist-info" / "METADATA").write_text("Name: vismatch\nVersion: 9.9\n")
+    write_file(folder / "vismatch" / "__init__.py", PACKAGE)
+    write_file(folder / "vismatch-9.9.dist-info" / "METADATA", "Name: vismatch\nVersion: 9.9\n")
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setitem(sys.modules, "vismatch", None)  # whose end takes away what the test has imported since
     del sys.modules["vismatch"]

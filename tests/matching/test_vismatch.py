@@ -85,8 +85,7 @@ def test_a_pair_does_not_depend_on_those_before_it(tmp_path: Path) -> None:
 
 
 def pipeline(name: str) -> Pipeline:
-    built: Pipeline = load_pipeline("vismatch", overrides=[f"matcher.name={name}"])
-    return built
+    return load_pipeline("vismatch", overrides=[f"matcher.name={name}"])
 
 
 def test_in_a_pipeline_failures_are_reasons(tmp_path: Path) -> None:
@@ -98,11 +97,9 @@ def test_in_a_pipeline_failures_are_reasons(tmp_path: Path) -> None:
     assert outcomes[0].features[0] == outcomes[0].features[1] > 50
     assert set(outcomes[0].seconds) == {"matching", "pruning", "estimation"}
     assert outcomes[1].reason.startswith("images: ImageError: ")
-    for name, reason in {
-        "broken": "matching: ValueError: vismatch broken: RuntimeError: out of memory",
-        "uneven": "matching: ValueError: vismatch uneven: ValueError: ",
-    }.items():
-        assert pipeline(name).run([good])[0].reason.startswith(reason)
+    for name, reason in (("broken", "RuntimeError: out of memory"), ("uneven", "ValueError: ")):
+        (outcome,) = pipeline(name).run([good])
+        assert outcome.reason.startswith(f"matching: ValueError: vismatch {name}: {reason}")
     (silent,) = pipeline("silent").run([good])
     assert not silent.solved
     assert "0 matches" in silent.reason

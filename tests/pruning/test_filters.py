@@ -121,21 +121,18 @@ def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
 MOST = [name for name in PRUNERS if name != "code" and not name.startswith(("clnet", "ncmnet"))]
 MANY = """
 import sys, torch
-from tests.processes import run_command
 from tests.laws import calibrated, quick_pruner, scene
-
-def peak():  # not ru_maxrss, which a process inherits from the one that started it
-    return 1024 * int(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+from tests.processes import peak_memory
 
 torch.set_num_threads(1)
-many, before = calibrated(scene(1, 50_000)), peak()
+many, before = calibrated(scene(1, 50_000)), peak_memory()
 for name in sys.argv[1:]:
     stage = quick_pruner(name)
     framed = {} if name == "frame_consistency" else {"lafs0": None, "lafs1": None}  # the scene's frames are random
     pruned = stage(many.replace(**framed))
     assert 0 < int(pruned.mask.sum()) <= 50_000, name
     assert pruned.prior is None or bool(torch.isfinite(pruned.prior).all()), name
-    print(name, peak() - before)
+    print(name, peak_memory() - before)
 """
 
 

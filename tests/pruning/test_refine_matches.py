@@ -54,17 +54,13 @@ def matches(count: int = 60, error: float = 0.5, scale: float = 12.0, seed: int 
     )  # fmt: skip
 
 
-def truth(c: Correspondences) -> np.ndarray:
-    return c.x0[0].double().numpy() @ MAP.T + OFFSET
-
-
 def error(c: Correspondences) -> np.ndarray:
-    return np.linalg.norm(c.x1[0].double().numpy() - truth(c), axis=1)
+    x0, x1 = (x[0].double().numpy() for x in (c.x0, c.x1))
+    return np.linalg.norm(x1 - (x0 @ MAP.T + OFFSET), axis=1)
 
 
 def stage(**options: Any) -> ImagePruner:
-    built: ImagePruner = presets.build("pruner", "refine_matches", **options)
-    return built
+    return presets.build("pruner", "refine_matches", **options)
 
 
 def pair(noise: float = 0.0) -> tuple[GreyPyramid, GreyPyramid]:

@@ -25,7 +25,7 @@ from fmtorch.core import Features
 from fmtorch.pipeline import load_pipeline
 from fmtorch.runs import ArrayCache, CachedFeatures, cached, configuration, image_digest
 from fmtorch.runs import fingerprint as configuration_module
-from tests.helpers import in_threads, same
+from tests.helpers import full_disk, in_threads, same, write_file
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (120, 160)) -> NDArray[np.uint8]:
@@ -143,13 +143,10 @@ def test_off_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cached(sift, "off") is sift
     assert cached(sift, False) is sift
     default, own = cached(sift, None, 1.5), cached(sift, str(tmp_path / "own"))
-    assert isinstance(default, CachedFeatures)
-    assert isinstance(own, CachedFeatures)
     assert (default.cache.folder, default.cache.limit) == (tmp_path / "home" / "features", 1_500_000_000)
     assert (own.cache.folder, own.cache.limit) == (tmp_path / "own", None)
     assert load_pipeline("sift_gms").extractor == sift  # a library call leaves nothing on disk
     kept = load_pipeline("sift_gms", overrides=[f"cache={tmp_path}/there", "cache_limit=1"]).extractor
-    assert isinstance(kept, CachedFeatures)
     assert kept.cache.folder == tmp_path / "there"
 
 
@@ -203,10 +200,8 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
 
     sift = presets.build("features", "sift")
     code = configuration(sift)["code"]
-    source = tmp_path / "package"
-    source.mkdir()
-    (source / "sift.py").write_text("edited")
-    monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(source / "sift.py"))
+    edited = write_file(tmp_path / "package" / "sift.py", "edited")
+    monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(edited))
     configuration_module.code_digest.cache_clear()
     assert configuration(sift)["code"] != code
     configuration_module.code_digest.cache_clear()
@@ -343,10 +338,7 @@ def test_threads_share_a_cache(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("numpy.savez", full)
+    monkeypatch.setattr("numpy.savez", full_disk)
     cache = ArrayCache(tmp_path)
     with pytest.warns(UserWarning, match="No space left on device"):
         cache.write("some", "name", {"a": np.zeros(1)})

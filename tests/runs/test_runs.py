@@ -24,6 +24,8 @@ from fmtorch.core import pair_key
 from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, fingerprint, identity_digest
 from fmtorch.runs import run_folder as parts_module
 from fmtorch.runs.run_folder import MAX_LEVEL, MERGED, content_digest, part_files
+from tests.evaluation.test_summary import F, bad
+from tests.helpers import full_disk, write_file
 
 CONFIG = {
     "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},
@@ -33,7 +35,6 @@ CONFIG = {
     "version": "0.1.0",
 }
 NAN = float("nan")
-F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 PIPELINE = {**CONFIG["pipeline"], "estimator": {"threshold": 0.5 + 2**-53, "samples": 2000}}
 IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
 
@@ -41,10 +42,6 @@ IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
 def row(name: str, **changes: object) -> PairRow:
     plain = PairRow(pair=name, key=pair_key(name), family="indoor", scene="s", ok=True, nsgd=0.01, F=F)
     return dataclasses.replace(plain, **changes)
-
-
-def failed(name: str) -> PairRow:
-    return PairRow(name, pair_key(name), family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8")
 
 
 def test_identity_changes_with_any_field_and_ignores_order_and_container_types() -> None:
@@ -98,8 +95,7 @@ def test_open_refuses_another_identity_and_says_what_differs(tmp_path: Path) -> 
     ],
 )
 def test_what_is_no_run_is_refused(name: str, content: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text(content)
+    write_file(tmp_path / name, content)
     with pytest.raises(RunFolderError, match=message):
         RunFolder.open(tmp_path / "run", CONFIG)
     assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [Path(name).name]
@@ -145,7 +141,7 @@ def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
         pose_reason=None,
     )  # fmt: skip
     run = RunFolder.open(tmp_path, CONFIG)
-    run.append([full, failed("b")])
+    run.append([full, bad("b", "too few matches: 5, needs 8")])
     run.append([row("c", inlier_rate=NAN)])
     run.append([])
     table = run.read()
@@ -306,11 +302,7 @@ def test_a_full_disk_leaves_parts_unmerged(tmp_path: Path, monkeypatch: pytest.M
     folder = RunFolder.open(tmp_path / "run", IDENTITY)
     for key in range(MERGED - 1):
         folder.append([numbered_row(key)])
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(parts_module.pa, "concat_tables", full)
+    monkeypatch.setattr(parts_module.pa, "concat_tables", full_disk)
     folder.append([numbered_row(MERGED - 1)])
     monkeypatch.undo()
     assert len(part_files(folder.path / "pairs")) == MERGED
@@ -343,8 +335,7 @@ def test_readers_lose_no_row_while_parts_are_merged(tmp_path: Path, monkeypatch:
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A checkout of another program, taken for this one."""
     folder = tmp_path / "checkout" / "fmtorch"
-    folder.mkdir(parents=True)
-    (folder / "a.py").write_text("one")
+    write_file(folder / "a.py", "one")
     (folder.parent / "pyproject.toml").write_text("")
     monkeypatch.setattr(fingerprint, "PACKAGE", folder)
     fingerprint.fmtorch_version.cache_clear()
@@ -424,8 +415,7 @@ FOLLOWED = {
 @pytest.mark.parametrize("module", FOLLOWED)
 def test_a_module_is_all_that_it_imports_of_its_own(module, tmp_path, monkeypatch):
     for name, text in OWN.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
+        write_file(tmp_path / name, text)
     monkeypatch.syspath_prepend(str(tmp_path))
     names = [name.removesuffix(".py").replace("/", ".") for name in OWN]
     for name in ("parts", "parts.deep", "folder", *names):

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import hashlib
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -143,11 +142,6 @@ def test_no_texture_of_the_test_split_is_in_training() -> None:
     assert not test & train
 
 
-def rule(wanted: set[tuple[int, int]]) -> Callable[[Keypoints, Keypoints, object], bool]:
-    """A stand-in for the pair rule that knows photographs by their number, which `numbered` hides in the keypoints."""
-    return lambda a, b, F: (int(a[0][0, 0]), int(b[0][0, 0])) in wanted
-
-
 @pytest.fixture
 def numbered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Replaces keypoints by the photograph's number; the list holds the photographs drawn so far."""
@@ -179,7 +173,8 @@ def test_a_small_plan_yields_the_planned_pairs_and_draws_no_more_than_it_needs(f
     ],
 )
 def test_spare_photographs_are_drawn_until_pairs_suffice(plan, wanted, drawn, kept, numbered, monkeypatch, tmp_path):
-    monkeypatch.setattr(generation, "matchable", rule(wanted))
+    """By a rule that knows photographs by their number, which `numbered` hides in the keypoints."""
+    monkeypatch.setattr(generation, "matchable", lambda a, b, F: (int(a[0][0, 0]), int(b[0][0, 0])) in wanted)
     views, pairs = read(generate(Task("indoor", "test", 0, 0, plan), tmp_path))
     assert len(views) == len(numbered) == drawn
     assert len(pairs) == kept

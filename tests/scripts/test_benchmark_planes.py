@@ -123,7 +123,6 @@ def test_an_estimate_is_judged_where_the_plane_is_seen(folder: Path) -> None:
     assert errors == [pytest.approx(0, abs=1e-9), pytest.approx(5), np.inf]
 
 
-SIZES = np.array([[760, 1000], [760, 1000]])
 K = np.array([[950.0, 0, 499.5], [0, 950, 379.5], [0, 0, 1]])
 R = cv2.Rodrigues(np.array([0.05, 0.3, 0.02]))[0]
 T = np.array([-1.0, 0.1, 0.3])
@@ -138,12 +137,12 @@ def item(K0: np.ndarray = K, name: str = "orbit/s/0") -> Item:
     x1[200:] = rng.uniform(0, 760, (50, 2))
     of = pair(name, fundamental(R, T, (K0, K)), K0=K0, K1=K, R=R, t=T)
     ratio = torch.linspace(0.3, 0.8, 250)[None]
-    sizes, frame = torch.from_numpy(SIZES), torch.diag(torch.tensor([4.0, 4])).expand(1, 250, 2, 2)
+    size, frame = torch.tensor([[760, 1000]]), torch.diag(torch.tensor([4.0, 4])).expand(1, 250, 2, 2)
     points = [torch.from_numpy(x)[None].float() for x in (x0, x1)]
     lafs0, lafs1 = (torch.cat([frame, x[..., None]], -1) for x in points)
     matches = Correspondences(
-        *points, torch.ones(1, 250, dtype=torch.bool), ratio=ratio, lafs0=lafs0, lafs1=lafs1, size0=sizes[:1],
-        size1=sizes[1:], key=torch.tensor([of.key]),
+        *points, torch.ones(1, 250, dtype=torch.bool), ratio=ratio, lafs0=lafs0, lafs1=lafs1, size0=size,
+        size1=size, key=torch.tensor([of.key]),
     )  # fmt: skip
     return plain_item(of, matches)
 

@@ -57,8 +57,10 @@ class MatchInputs:
         """The input and the mask of its columns: matches of `c.mask` whose normalised coordinates are finite.
         Raises ValueError where image sizes or calibration matrices are missing."""
         x0, x1 = (torch.where(c.mask[..., None], x, 0) for x in (c.x0, c.x1))
-        points = [_by_size(x0, c.size0, "size0"), _by_size(x1, c.size1, "size1")] if self.coordinates == "size" else [
-            _by_calibration(x0, c.K0, "K0"), _by_calibration(x1, c.K1, "K1")]  # fmt: skip
+        if self.coordinates == "size":
+            points = [_by_size(x0, c.size0, "size0"), _by_size(x1, c.size1, "size1")]
+        else:
+            points = [by_calibration(x, K) for x, K in zip((x0, x1), _calibrations(c), strict=True)]
         coordinates = torch.cat(points, -1).float()
         mask = c.mask & torch.isfinite(coordinates).all(-1)
         channels = [*torch.where(mask[..., None], coordinates, 0).unbind(-1)]
@@ -68,13 +70,11 @@ class MatchInputs:
         return torch.stack(channels, 1), mask
 
     def unit(self, c: Correspondences) -> Float[Tensor, " b"]:
-        """How many pixels one unit of the coordinates is, on average over both images; as `x0` in type.
-        Raises ValueError where image sizes or calibration matrices are missing."""
+        """Pixels of one unit of the coordinates, the mean of both images, typed as `x0`; ValueError where unknown."""
         if self.coordinates == "size":
             unit0, unit1 = (_known(size, f"size{i}", BY_SIZE).amax(-1) for i, size in enumerate((c.size0, c.size1)))
         else:
-            matrices = (_known(K, f"K{i}", BY_CALIBRATION) for i, K in enumerate((c.K0, c.K1)))
-            unit0, unit1 = ((K[:, 0, 0].abs() + K[:, 1, 1].abs()) / 2 for K in matrices)
+            unit0, unit1 = ((K[:, 0, 0].abs() + K[:, 1, 1].abs()) / 2 for K in _calibrations(c))
         return (unit0 + unit1).to(c.x0.dtype) / 2
 
 
@@ -99,8 +99,12 @@ def _by_size(x: Float[Tensor, "b n 2"], size: Tensor | None, name: str) -> Float
     return (x - size.flip(-1)[:, None] / 2) / size.amax(-1)[:, None, None]
 
 
-def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
-    K = _known(K, name, BY_CALIBRATION)
+def _calibrations(c: Correspondences) -> list[Tensor]:
+    return [_known(K, f"K{i}", BY_CALIBRATION) for i, K in enumerate((c.K0, c.K1))]
+
+
+def by_calibration(x: Float[Tensor, "b n 2"], K: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:
+    """The points K^-1 x, of an upper triangular K with last row (0, 0, 1)."""
     fx, skew, cx, fy, cy = (K[:, i, j, None].to(x.dtype) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     y = (x[..., 1] - cy) / fy
     return torch.stack([(x[..., 0] - cx - skew * y) / fx, y], -1)
@@ -145,8 +149,7 @@ LARGEST_RESIDUAL = 0.5  # of the same; as published
 
 
 class WithOptions(nn.Module):
-    """A network of `inputs`, with `options`, which its files and the run's identity hold.
-    Raises ValueError for unknown coordinates or side information."""
+    """A network of `inputs` with `options`, part of its identity. Raises ValueError for unknown coordinates or side."""
 
     def __init__(self, coordinates: str, side: Sequence[str], **options: Any) -> None:
         super().__init__()
@@ -229,12 +232,11 @@ class DFE(OfBackbone):
     """Iterated weighted 8-point fits; a network predicts the weights, from the second fit on with the last residuals.
 
     Ranftl & Koltun, "Deep fundamental matrix estimation", ECCV 2018, section 4, through `geometry.reweighted_fits`.
-    What differs from the authors' code: one network serves all iterations (theirs has one for the first, one for the
-    others); its layers are context norm, batch norm and ReLU over real matches, where theirs are instance norm with a
-    scale and a shift, which is the same affine map, and leaky ReLU; residuals are Sampson distances on a logarithmic
-    scale, since on theirs, linear to half the image, those of a pixel and of five are the same to a network; matches
-    are weighted by w, theirs by w^2; and a second output gives the log-odds that a match is an inlier, since weights
-    that sum to one are no probabilities.
+    What differs from the authors' code: one network serves all iterations (theirs: another for the first); its layers
+    are context norm, batch norm and ReLU over real matches, where theirs are instance norm and an affine map, which is
+    the same, and leaky ReLU; residuals are Sampson distances on a logarithmic scale, since on theirs, linear to half
+    the image, those of a pixel and of five are the same to a network; matches are weighted by w, theirs by w^2; and a
+    second output gives the log-odds that a match is an inlier, since weights that sum to one are no probabilities.
 
     Args:
         widths: of the layers. As published, with five iterations, a pair costs ten times what it costs `LC`.

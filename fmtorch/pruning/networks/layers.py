@@ -73,8 +73,7 @@ class Perceptron(nn.Module):
 
 
 class _Norm(nn.Module):
-    """Batch normalisation's scale, shift and running statistics, which are kept as torch's BatchNorm keeps them:
-    momentum 0.1, variance times ``M / (M - 1)`` for M matches."""
+    """Batch normalisation's scale, shift and running statistics, as torch's: momentum 0.1, variance unbiased."""
 
     running_mean: Tensor
     running_var: Tensor
@@ -117,8 +116,7 @@ class ContextBatchNorm(_Norm):
     variance v before, to variance ``v / (v + eps)``. The statistics that batch normalisation takes over all matches of
     the batch are therefore known: mean 0 and the mean of ``v / (v + eps)``, pairs weighted by their matches. Both
     normalisations are one affine map for each pair and channel, which is what is computed, with its own gradient.
-    A channel that is constant in a pair has no gradient there. The running mean only ever moves towards 0; it is kept
-    for weights trained elsewhere."""
+    A channel constant in a pair has no gradient there. The running mean, ever nearer to 0, is for others' weights."""
 
     relu = False
 
@@ -204,8 +202,7 @@ class _ContextBatchNorm(torch.autograd.Function):
 
 
 class ResidualBlock(nn.Module):
-    """Perceptron, context norm, batch norm, ReLU; twice; and the input added (Yi et al., CVPR 2018, section 3.2).
-    Its perceptrons have no bias: context normalisation takes any away."""
+    """Perceptron without bias, context norm, batch norm, ReLU; twice; the input added (Yi et al., CVPR 2018, 3.2)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -269,8 +266,7 @@ def attention(
 
 @torch.no_grad()
 def nearest(x: Float[Tensor, "c b n"], slots: Slots, count: int) -> Int[Tensor, "b n k"]:
-    """The nearest matches of each match by its features, nearest first, itself among them; itself again past the last.
-    In full precision also within autocast."""
+    """The matches nearest by features, nearest first, itself among them and past the last; in full precision always."""
     wide = (x if x.dtype == torch.float64 else x.float()).transpose(0, 1)
     squared, places = wide.square().sum(1, keepdim=True), list[Tensor]()
     with torch.autocast(x.device.type, enabled=False):

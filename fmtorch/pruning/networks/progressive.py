@@ -67,8 +67,7 @@ class OrderAwareContext(nn.Module):
         self.linear1 = layers.Perceptron(channels, clusters)
 
     def forward(self, x: Float[Tensor, "c b n"], slots: layers.Slots) -> Float[Tensor, "c b n"]:
-        """DiffPool: ``S = softmax over matches, x S^T``; DiffUnpool: ``S = softmax over clusters, y S``;
-        both S from x."""
+        """DiffPool ``x S^T``, S a softmax over matches; DiffUnpool ``y S``, over clusters; both S from x."""
         share = slots.softmax(self.linear0(self.norm0(x, slots)))
         y, nodes = torch.einsum("cbn,kbn->cbk", x, share), slots.columns(len(share))
         y = layers.through(self.filters, y, nodes)
@@ -101,8 +100,7 @@ class OANet(WithOptions):
         blocks: of all stages; half of a stage's filter clusters, as many blocks stand before and after.
         clusters: of the matches.
         stages: the first, and those that refine it, with parameters of their own.
-        coordinates: "size", for the fundamental matrix, or "K", for the essential matrix as published.
-        side: side information, see `MatchInputs`. Raises ValueError for unknown coordinates or side information.
+        coordinates, side: as of `LC`.
     """
 
     def __init__(
@@ -209,8 +207,7 @@ class CLNet(Progressive):
         neighbors: of each step, multiples of three.
         ratio: of the matches that a step keeps.
         threshold: squared symmetric epipolar distance, in units of the coordinates, at which P(inlier) is one half.
-        coordinates: "size", for the fundamental matrix, or "K", for the essential matrix as published.
-        side: side information, see `MatchInputs`. Raises ValueError for unknown coordinates or side information.
+        coordinates, side: as of `LC`.
     """
 
     def __init__(
