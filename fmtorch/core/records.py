@@ -10,7 +10,7 @@ import json
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 import torch
 from jaxtyping import AbstractArray, Int
@@ -118,11 +118,11 @@ class Record:
         cls.declared = arrays_of(cls)
         cls.per_slot = tuple(name for name, field in cls.declared.items() if SLOTS in field.shape)
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
         """The same record with every tensor on `device`."""
         return self._each(lambda value: value.to(device))
 
-    def detach(self) -> Self:
+    def detach(self: AnyRecord) -> AnyRecord:
         """The same record cut off from the graph."""
         return self._each(lambda value: value.detach())
 
@@ -133,18 +133,18 @@ class Record:
             return False
         return any(isinstance(v, Tensor | Record) and v.requires_grad for v in vars(self).values())
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self: AnyRecord, **changes: Any) -> AnyRecord:
         """A copy with some fields changed (shapes are checked again)."""
-        return cast(Self, dataclasses.replace(cast(Any, self), **changes))
+        return cast(AnyRecord, dataclasses.replace(cast(Any, self), **changes))
 
     @classmethod
-    def unchecked(cls, **fields: Any) -> Self:
+    def unchecked(cls: type[AnyRecord], **fields: Any) -> AnyRecord:
         """A record of all its fields, unchecked: of tensors that fit because of how they are made."""
         record = object.__new__(cls)
         vars(record).update(fields)
         return record
 
-    def derived(self, **changes: Any) -> Self:
+    def derived(self: AnyRecord, **changes: Any) -> AnyRecord:
         """As `replace`, unchecked, by tensors that fit because of how they are made of this record: not a user's."""
         return self.unchecked(**{**vars(self), **changes})
 
@@ -162,7 +162,7 @@ class Record:
             save_file({name: value.contiguous() for name, value in tensors.items()}, temporary, stored)
 
     @classmethod
-    def load(cls, path: Path | str) -> Self:
+    def load(cls: type[AnyRecord], path: Path | str) -> AnyRecord:
         """The record that `save` wrote, on the CPU, checked again.
         Raises FileNotFoundError, or ValueError for another file."""
         try:
@@ -184,10 +184,10 @@ class Record:
         shapes = (f"{name}: {tuple(x.shape)} {str(x.dtype).removeprefix('torch.')}" for name, x in tensors)
         return f"{type(self).__name__}({', '.join(shapes)})"
 
-    def _map(self, function: Any, **changes: Any) -> Self:
+    def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)
 
-    def _each(self, function: Any) -> Self:
+    def _each(self: AnyRecord, function: Any) -> AnyRecord:
         """As `_map`, of a function that keeps shape and kind."""
         return self.derived(**_mapped(self, function, Record._each))
 

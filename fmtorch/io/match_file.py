@@ -6,7 +6,7 @@ import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from fmtorch.io.match_store import MATRICES, PairGeometry
 
 MEMORY = 256  # images whose keypoints are kept
 Names = tuple[str, str]
+OpenFiles = TypeVar("OpenFiles", bound="_OpenFiles")
 
 
 class _OpenFiles:
@@ -27,7 +28,7 @@ class _OpenFiles:
         self.files, self._output, self._open = files, output, contextlib.ExitStack()
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
-    def __enter__(self) -> Self:
+    def __enter__(self: OpenFiles) -> OpenFiles:
         return self
 
     def __exit__(self, *error: object) -> None:
