@@ -251,7 +251,7 @@ RUN: list[list[str]] = []
 """What has been run; a command that stands on several pages is run once."""
 
 
-@pytest.mark.parametrize("page_commands", parameters())
+@pytest.mark.parametrize("page_commands", [*parameters()])
 def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in page_commands:
