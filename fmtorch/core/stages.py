@@ -5,6 +5,7 @@ Beside them the grey images that pruners look at, and the extractor of matchers 
 import contextlib
 import dataclasses
 import inspect
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
@@ -167,10 +168,11 @@ def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
         raise
 
 
-def _state(given: Sequence[Any]) -> list[float]:
+def _state(given: Sequence[Any]) -> list[int]:
     """What tells whether matches, or the pixels of an image, were changed in place."""
     fields = [t for c in given if isinstance(c, Correspondences) for t in (c.x0, c.x1, c.mask) if not t.is_inference()]
-    return [t._version for t in fields] + [float(image.sum()) for image in given if isinstance(image, np.ndarray)]
+    images = [np.ascontiguousarray(image).data for image in given if isinstance(image, np.ndarray)]
+    return [*(t._version for t in fields), *map(zlib.crc32, images)]
 
 
 def name_of(part: object) -> str:

@@ -28,10 +28,10 @@ def stretch_across(F: Any, points: Any, J: Any) -> Any:
     normals; one where there are none. F: (9, ...); points: (4, ..., n); J: (..., n, 2, 2, 2), derivatives of points of
     both images by the photographs'. Arrays or tensors."""
     x0, y0, x1, y1 = points
-    lines = [(F[k] * x1 + F[k + 3] * y1 + F[k + 6], F[k + 1] * x1 + F[k + 4] * y1 + F[k + 7]) for k in (0,)]
-    lines += [(F[0] * x0 + F[1] * y0 + F[2], F[3] * x0 + F[4] * y0 + F[5])]
+    line0 = F[0] * x1 + F[3] * y1 + F[6], F[1] * x1 + F[4] * y1 + F[7]
+    line1 = F[0] * x0 + F[1] * y0 + F[2], F[3] * x0 + F[4] * y0 + F[5]
     there = here = 0.0
-    for k, (a, b) in enumerate(lines):
+    for k, (a, b) in enumerate((line0, line1)):
         u, v = (a * J[..., k, 0, i] + b * J[..., k, 1, i] for i in (0, 1))
         there, here = there + (u * u + v * v), here + (a * a + b * b)
     none = (here == 0) | (there == 0)

@@ -129,9 +129,9 @@ class DatabaseImage:
     """An image with its keypoints, px, with (0, 0) at the centre of the first pixel.
     size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
     would have put them, NaN where it sees nothing. stretch: its derivatives (n, 2, 2), None where it is as stored.
-    deviation: relative, of the focal length of K: 0 where it was
-    calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera. warning: what of it is not
-    taken for known. Scales, orientations and shapes of keypoints are not used (docs/verify.md)."""
+    deviation: relative, of the focal length of K: 0 where it was calibrated, infinite where it is COLMAP's guess.
+    problem: what is wrong with the camera. warning: what of it is not taken for known. Scales, orientations and shapes
+    of keypoints are not used (docs/verify.md)."""
 
     name: str
     camera_id: int

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.lenses import STEP, Lens, Matrix, division, division_lens, lines_of_sight, undistortion
+from fmtorch.core.lenses import Lens, Matrix, division, division_lens, lines_of_sight, undistortion
 from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate
 from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
@@ -75,9 +75,7 @@ class CalibratedLenses:
 
     def in_view(self, seen: Correspondences) -> Correspondences:
         """The undistorted matches that tell the type of a pair: those that are not far off in pinholes' images."""
-        if seen.stretch is None:
-            return seen
-        return seen.keep(mean_stretch(seen.stretch.detach(), sqrt) < MAX_STRETCH)
+        return seen if seen.stretch is None else seen.keep(mean_stretch(seen.stretch.detach(), sqrt) < MAX_STRETCH)
 
     def completed(self, estimate: Estimate, c: Correspondences, seen: Correspondences) -> Estimate:
         """The estimate of undistorted matches `seen`, with the pose of what was seen beyond 90 degrees of an axis, too,
@@ -97,7 +95,7 @@ class CalibratedLenses:
         R, t = cast(Tensor, estimate.R), cast(Tensor, estimate.t)
         K0, K1 = (torch.as_tensor(K).to(estimate.F).expand(len(R), 3, 3) for K in self.K)
         pose = pose_from_fundamental(estimate.F, K0, K1, seen.x0, seen.x1, estimate.inliers, behind=self.behind)
-        other = (component_sum((R * pose.R).flatten(1), 1) < 3 - STEP) & pose.valid & turned
+        other = (component_sum((R * pose.R).flatten(1), 1) < 3 - 1e-6) & pose.valid & turned  # by 0.06 degrees
         opposite = (component_sum(t * pose.t, 1) < 0) & pose.valid & turned
         R, t = torch.where(other[:, None, None], pose.R, R), torch.where((other | opposite)[:, None], pose.t, t)
         fields = {}

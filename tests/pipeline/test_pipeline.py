@@ -363,7 +363,7 @@ def swapped_sizes(a: Features, b: Features) -> Correspondences:
         ("pruners", {"own": lambda c: Correspondences(c.x0[:, :5], c.x1[:, :5], c.mask[:, :5], key=c.key)},
          r"returned matches of shape \(1, 5\); it must be that of the mask, \(1, 9\)"),
         ("pruners", {"own": lambda c: c.replace(x0=c.x0.sub_(1))}, "WrongPart: .*<lambda> changes what it is given"),
-        ("features", lambda image: image.fill(0), "WrongPart: .*<lambda> changes what it is given, which others use"),
+        ("features", lambda image: image.sort(0), "WrongPart: .*<lambda> changes what it is given, which others use"),
         ("estimator", 5, r"WrongPart: builtins.int cannot be called; it must have __call__\(c, seed=0\)"),
         ("estimator", lambda c, seed: estimate(c).replace(ok=torch.tensor([False])), "<lambda> gives no reason$"),
         ("estimator", lambda c, seed: c.x0, "^estimation: WrongPart: .* returned a Tensor; it must return Estimate"),
