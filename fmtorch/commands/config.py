@@ -1,5 +1,6 @@
 """How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
 
+import argparse
 import contextlib
 import functools
 import pdb
@@ -35,6 +36,8 @@ SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_
 OVERRIDE = re.compile(r"(?P<key>(?:\+\+|\+)?[A-Za-z_][\w./@:-]*)=(?P<value>.*)", re.DOTALL)
 LITERAL = re.compile(r"null|true|false|\?\?\?|'.*'|\".*\"", re.IGNORECASE | re.DOTALL)  # what a path field may hold
 
+if sys.version_info >= (3, 14):  # where argparse formats each help, of which Hydra 1.3 has one that is no text
+    argparse.ArgumentParser._check_help = lambda *_: None
 for each in COMMANDS.values():
     quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
     own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": each.sweeps, "subdir": "."}}

@@ -13,7 +13,7 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float, Int, Int8
@@ -221,7 +221,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
     """Write a network's backbone as ONNX: float `matches` (1, channels, N), N free, to `outputs` (1, K, N).
     Needs the extra `export`. temperature: as of `save_weights`. Raises ValueError for a network that is not
     `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch."""
-    if not isinstance(network, learned.Exportable):
+    if not learned.exportable(network):
         missing = f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`"
         raise ValueError(f"{missing}: it cannot be exported to ONNX, and runs with torch alone")
     outside = [key for key in network.state_dict() if not key.startswith("backbone.")]
@@ -229,14 +229,15 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
         raise ValueError(f"{', '.join(outside)}: parameters outside the backbone would not be in the ONNX file")
     import onnx
 
-    alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
-    example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=torch.Generator().manual_seed(0))
+    parts = cast(learned.Exportable, network)
+    alone = _OnePair(copy.deepcopy(parts.backbone)).eval().cpu().float()
+    example = torch.rand(1, parts.input_channels, EXAMPLE_MATCHES, generator=torch.Generator().manual_seed(0))
     model = onnx_model(alone, example, learned.INPUT, learned.OUTPUT, free_axis=2)
     onnx.helper.set_model_props(model, learned.metadata(network, temperature))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished, torch.no_grad():
         onnx.save(model, unfinished)
-        x = torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES)
+        x = torch.rand(1, parts.input_channels, 3 * EXAMPLE_MATCHES)
         slots = layers.Slots(torch.tensor([float(x.shape[2])]), None)
         exported = learned.OnnxBackbone(network, unfinished, "")(x, slots)
         expect_equal(unfinished, exported, alone(x))
@@ -305,7 +306,7 @@ def write_result(
     fitted = temperature(evaluation.logit, evaluation.label)
     files = [folder / f"{name}.safetensors"]
     save_weights(network, files[0], temperature=fitted)
-    if isinstance(network, learned.Exportable) and importlib.util.find_spec("onnxscript") is not None:
+    if learned.exportable(network) and importlib.util.find_spec("onnxscript") is not None:
         files.append(folder / f"{name}.onnx")
         export_onnx(network, files[-1], temperature=fitted)
     card = folder / f"{name}.md"

@@ -73,9 +73,7 @@ def test_a_run_from_start_to_end(data: list[str], command: RunCommand, tmp_path:
     assert "2 of the 5 pairs of the run" in shown
     assert "of all 5 pairs" in shown
 
-    # Refused for another identity, which is told.
-    other = command("eval", *words, "seed=1", cwd=tmp_path)
-    assert re.search("ended: .*holds another run.*seed: 0 -> 1", other)
+    assert re.search("ended: .*holds another run.*seed: 0 -> 1", command("eval", *words, "seed=1", cwd=tmp_path))
 
 
 def test_shards_are_one_run(data: list[str], command: RunCommand, tmp_path: Path) -> None:

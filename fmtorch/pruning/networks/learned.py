@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -121,7 +121,6 @@ class Prediction(NamedTuple):
     judged: Bool[Tensor, "stages b n"] | None = None
 
 
-@runtime_checkable
 class Exportable(Protocol):
     """A network whose parameters all belong to its `backbone`, a function of tensors: ONNX Runtime can take its place.
     input_channels: of the backbone. options: the arguments that build the network, which its files state."""
@@ -133,6 +132,11 @@ class Exportable(Protocol):
     def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
         """The prediction, with `backbone` or what takes its place."""
         ...
+
+
+def exportable(network: nn.Module) -> bool:
+    """Whether a network is `Exportable`: `isinstance` does not see the submodules of a Module from Python 3.12 on."""
+    return all(hasattr(network, name) for name in ("backbone", "input_channels", "options", "predict"))
 
 
 def predict(network: nn.Module, c: Correspondences) -> Prediction:
@@ -201,7 +205,7 @@ class LearnedPruner:
         suffix = "" if file is None else Path(file).suffix
         if runtime != "auto" and suffix in SUFFIXES.values() and suffix != SUFFIXES[runtime]:
             raise ValueError(f"runtime={runtime} reads {SUFFIXES[runtime]}, not {file}")
-        if not isinstance(network, Exportable) and "onnx" in (runtime, suffix.removeprefix(".")):
+        if not exportable(network) and "onnx" in (runtime, suffix.removeprefix(".")):
             raise ValueError(f"{type(network).__name__} is not `Exportable`: it runs with runtime=torch and a "
                              "file .safetensors")  # fmt: skip
         if file is None and runtime == "onnx":
@@ -269,7 +273,7 @@ class LearnedPruner:
         suffix = Path(self.file).suffix
         if suffix in SUFFIXES.values():
             return next(name for name, s in SUFFIXES.items() if s == suffix)
-        fits = device.type == "cpu" and isinstance(self.network, Exportable) and self._path("onnx").is_file()
+        fits = device.type == "cpu" and exportable(self.network) and self._path("onnx").is_file()
         return "onnx" if fits else "torch"
 
     def __getstate__(self) -> dict[str, Any]:
