@@ -19,7 +19,7 @@ _TIFF = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")  # the second of each order: Bi
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
-_TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
+_set_log_level, _SILENT = getattr(cv2.utils, "logging", cv2).setLogLevel, 0  # of OpenCV 5, of OpenCV 4
 
 MAX_PIXELS = 2**28  # by the header: a few kilobytes may claim gigabytes; the largest sensors have 2e8
 
@@ -137,14 +137,14 @@ def _by_opencv(path: Path, data: bytes) -> Array:
     """The pixels, of any depth, grey or RGB; a TIFF file with an orientation is turned."""
     deep = 0 if data[4:8] == b"ftyp" else cv2.IMREAD_ANYDEPTH  # 10 bits of an AVIF are a photograph's
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION | deep
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    level = _set_log_level(_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f"{path}: OpenCV refuses it ({error.err}); it must be a sound image") from error
     finally:
-        if level != cv2.utils.logging.LOG_LEVEL_SILENT:  # as another thread may have set it
-            cv2.utils.logging.setLogLevel(level)
+        if level != _SILENT:  # as another thread may have set it
+            _set_log_level(level)
     if image is None:
         right = "a sound TIFF of 8 or 16 bits or float32, best in strips" if data[:4] in _TIFF else FORMATS
         raise ImageError(f"{path}: no image that can be decoded; it must be {right}")
@@ -219,7 +219,7 @@ def _jpeg_decodes(data: bytes) -> bool:
     frame = next((data[at : at + 8] for marker, at in _jpeg_segments(data) if marker in _HUFFMAN_FRAMES), b"")
     if len(frame) < 8 or frame[2] != 8 or frame[7] not in (1, 3):
         return True
-    decoder = _TurboJpeg()
+    decoder = kornia_rs.io.ImageDecoder()
     try:
         decoder.read_header(data)
     except Exception:  # the library knows no other; a form of JPEG that it does not take

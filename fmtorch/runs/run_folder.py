@@ -90,7 +90,7 @@ class PairRow:
 
 _ARROW: dict[Any, pa.DataType] = {
     str: pa.string(), int: pa.int64(), bool: pa.bool_(), float: pa.float64(),
-    Sequence[float]: pa.list_(pa.float64(), 9),
+    Sequence[float]: pa.list_(pa.float64()),  # of 9; with a fixed size pyarrow before 26 reads no null
 }  # fmt: skip
 
 
