@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.matching import nearest_neighbors
 from tests import laws
 from tests.test_function_laws import FUNCTIONS, differentiated, pairs
 from tests.test_laws import PLAIN
@@ -31,6 +32,13 @@ def test_functions_and_their_gradients(name: str) -> None:
         assert_there(value, other, name)
     for field, gradient in own.items():
         assert_there(gradients[field], gradient, f"{name}, gradient by {field}")
+
+
+def test_nearest_neighbours_where_products_of_floats_are_rounded_to_11_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    integers = torch.randint(0, 200, (2, 500, 128), generator=torch.Generator().manual_seed(0)).float()
+    expected = nearest_neighbors(*integers)
+    monkeypatch.setattr("torch.backends.cuda.matmul.allow_tf32", True)
+    assert all(map(torch.equal, [value.cpu() for value in nearest_neighbors(*integers.cuda())], expected))
 
 
 @pytest.mark.parametrize("subject", PLAIN, ids=[s.name for s in PLAIN])

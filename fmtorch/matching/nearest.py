@@ -257,12 +257,12 @@ def nearest_neighbors(
     mask0: Bool[Tensor, "*batch n0"] | None = None,
     mask1: Bool[Tensor, "*batch n1"] | None = None,
     *,
-    chunk: int = 64,
+    chunk: int = 1024,
 ) -> Neighbors:
     """The two nearest descriptors of image 1 for each of image 0, and the nearest the other way, in one pass.
     Squared distances are computed as integers, so no rounding can depend on the batch, the block or the device: integer
-    descriptors such as SIFT's are taken as they are (float32), others on a grid of 2^-25 of the longest descriptor of
-    the pair (float64). Only `chunk` rows of the distance matrix exist at a time; `chunk` changes speed and memory,
+    descriptors such as SIFT's are taken as they are, others on a grid of 2^-25 of the longest descriptor of the pair.
+    Where no kernels run, as on a GPU, `chunk` rows of the distance matrix exist at a time: it changes speed and memory,
     never the result. Masked and non-finite descriptors neither have neighbours nor are any. Not differentiable."""
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}; it must be at least 1")
@@ -310,7 +310,7 @@ def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     """Both sets as integer-valued vectors in a type in which their squared distances are exact, and their unit."""
     longest = max(_longest(d0), _longest(d1))
     integral = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
-    if integral and longest <= _FLOAT32_NORM:
+    if integral and longest <= _FLOAT32_NORM and not d0.is_cuda:  # where factors may be rounded to 11 bits (TF32)
         return d0.float(), d1.float(), 1.0
     ratio = MAX_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
     exponent = math.frexp(ratio)[1] - 1  # a power of two, so that scaling is exact
@@ -372,10 +372,10 @@ class NearestNeighborMatcher:
 
     mutual: keep only matches whose partner's own nearest neighbour is the feature itself. It costs nothing, both
     directions being found in one pass; without it the result says which matches these are (`Correspondences.mutual`).
-    chunk: rows of the distance matrix that exist at a time; changes speed and memory only."""
+    chunk: rows of the distance matrix that exist at a time on a GPU; changes speed and memory only."""
 
     mutual: bool = False
-    chunk: int = 64
+    chunk: int = 1024
 
     def __call__(self, features0: Features, features1: Features) -> Correspondences:
         """The matches of one pair, or of a batch where features have a leading dimension; ValueError if both differ."""
