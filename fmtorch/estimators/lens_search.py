@@ -33,9 +33,8 @@ ROWS = 12  # of a match: derivatives by nine entries and two lenses, and the res
 
 
 class LensPrior(NamedTuple):
-    """What is known of the lenses of both images.
-    mean, precision: (2,), of lambda, one over its variance. shared: whether there is one lens for both. diagonal: (2,),
-    half of the images', in the unit of the points."""
+    """What is known of the lenses of both images. mean, precision: (2,), of lambda, one over its variance. shared:
+    whether there is one lens for both. diagonal: (2,), half of the images', in the unit of the points."""
 
     mean: F8x1
     precision: F8x1

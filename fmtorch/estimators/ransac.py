@@ -100,9 +100,8 @@ def stage(options: Stage | Mapping[str, Any] | None, kind: type[Stage]) -> Stage
 def thresholds(
     threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
 ) -> tuple[float, float]:
-    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
-    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
-    inliers."""
+    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for. score, inliers,
+    optimization: as options name these parts. stops: whether there is a stopping rule, which counts inliers."""
     by_distance = stops or takes("inliers", inliers, "threshold")
     if inlier_threshold is not None and not by_distance:
         raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")

@@ -59,9 +59,8 @@ class Verified(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """Rounds of minimal samples: drawn, solved, scored, the best kept.
-    pool: the best models that are kept. hypotheses: samples drawn at most. round: samples between two looks at the
-    stopping rule, None: never before `hypotheses`."""
+    """Rounds of minimal samples: drawn, solved, scored, the best kept. pool: the best models that are kept. hypotheses:
+    samples drawn at most. round: samples between two looks at the stopping rule, None: never before `hypotheses`."""
 
     family: Matrices | FundamentalWithFocals
     sampler: Sampler

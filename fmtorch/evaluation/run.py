@@ -329,8 +329,7 @@ def _measured(path: Path) -> tuple[float, float]:
 
 
 class Batch(NamedTuple):
-    """Pairs to evaluate.
-    export: whether keypoints, matches and F are to be exported. signed: of `pose_errors`."""
+    """Pairs to evaluate. export: whether keypoints, matches and F are to be exported. signed: of `pose_errors`."""
 
     pairs: list[ImagePair]
     seed: int

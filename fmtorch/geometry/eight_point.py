@@ -73,9 +73,8 @@ def linear_fundamental(
 def normal_matrix(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch 9 9"]:
-    """The sum of w a a^T, with a . vec(F) = x1^T F x0.
-    Expects normalised float64 points, finite, with weight zero for those that do not count. The points' leading shape
-    broadcasts against that of the weights."""
+    """The sum of w a a^T, with a . vec(F) = x1^T F x0. Expects normalised float64 points, finite, with weight zero for
+    those that do not count. The points' leading shape broadcasts against that of the weights."""
     # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones, in parts that fit a cache.
     p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
     sums = torch.cat([stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)], -2)

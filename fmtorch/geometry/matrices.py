@@ -145,11 +145,10 @@ SQUARINGS = 14  # the power 2^14 parts eigenvalues whose ratio is 0.998
 
 def smallest_eigenvector(M: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """The unit eigenvector of the smallest eigenvalue of positive semi-definite M, and whether it is determined.
-    Inverse iteration by repeated squaring: with M = L D L^T, the powers M^-1, M^-2, M^-4, ... (each at unit trace)
-    turn into v v^T. The largest entry of v is positive. It counts as determined when the rank is at least n - 1, that
-    is when the trace of M^-1 across v is not too large. M must be finite, float64.
-    Gradient: with gaps g_j to the smallest eigenvalue, sum_j v_j v_j^T g_j / (g_j^2 + eps^2) over the other
-    eigenvectors, finite where eigenvalues meet."""
+    Inverse iteration by repeated squaring: with M = L D L^T, the powers M^-1, M^-2, M^-4, ... (each at unit trace) turn
+    into v v^T. The largest entry of v is positive. It counts as determined when the rank is at least n - 1, that is
+    when the trace of M^-1 across v is not too large. M must be finite, float64. Gradient: with gaps g_j to the smallest
+    eigenvalue, sum_j v_j v_j^T g_j / (g_j^2 + eps^2) over the other eigenvectors, finite where eigenvalues meet."""
     return cast(tuple[Tensor, Tensor], _SmallestEigenvector.apply(M))  # type: ignore[no-untyped-call]
 
 

@@ -125,12 +125,11 @@ _lock = threading.RLock()  # numba compiles one function at a time; a kernel may
 
 
 class Kernel(Generic[P, R]):
-    """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
-    The signature is that of its annotations. Arrays of another dtype, number of axes or memory order are refused with a
-    TypeError, never converted, and so are numbers in a group; other numbers are converted. Kernels and inner functions
-    may call it, too. It holds no Python lock while it runs, unless it is made with holds_gil=True. With
-    FMTORCH_KERNELS=off, for a debugger, the plain function runs, a thousand times slower. Raises ImportError where
-    numba cannot be imported."""
+    """A function of NumPy arrays and numbers, compiled for one signature when it is first called. The signature is that
+    of its annotations. Arrays of another dtype, number of axes or memory order are refused with a TypeError, never
+    converted, and so are numbers in a group; other numbers are converted. Kernels and inner functions may call it, too.
+    It holds no Python lock while it runs, unless it is made with holds_gil=True. With FMTORCH_KERNELS=off, for a
+    debugger, the plain function runs, a thousand times slower. Raises ImportError where numba cannot be imported."""
 
     __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
     __call__: Callable[P, R]

@@ -259,9 +259,8 @@ class ExecutorFields:
 
 
 def execution_of(config: DictConfig, workers: int | None = None, processes: bool | None = None) -> Execution:
-    """The execution that a composed config asks for.
-    workers: in place of ``executor.workers``. processes: true or false in place of the executors of these kinds. Raises
-    ValueError for what is wrong or contradicts itself."""
+    """The execution that a composed config asks for. workers: in place of ``executor.workers``. processes: true or
+    false in place of the executors of these kinds. Raises ValueError for what is wrong or contradicts itself."""
     options = plain(config.executor)
     fields = read_fields(ExecutorFields, config.executor, "executor")
     if workers is not None and fields.workers not in (None, workers):

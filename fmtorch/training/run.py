@@ -439,9 +439,8 @@ def _oanet_pairs(root: Path, config: DictConfig, options: TrainOptions) -> Named
 
 
 def _split(dataset: PairDataset, last: int | None, by_image: bool) -> tuple[list[int], list[int]]:
-    """Indices of the pairs to train on, and of those in the last scenes of each family.
-    by_image: where each family has one scene, of those among its last quarter of images; pairs that join images of both
-    sides are in neither."""
+    """Indices of the pairs to train on, and of those in the last scenes of each family. by_image: where each family has
+    one scene, of those among its last quarter of images; pairs that join images of both sides are in neither."""
     pairs = [dataset[i] for i in range(len(dataset))]
     scenes = [(pair.family, pair.scene) for pair in pairs]
     held = last_scenes(scenes, last)

@@ -183,8 +183,7 @@ def test_gradient_stays_bounded(s):
     F = random_matrices((50,), s).requires_grad_()
     target = random_matrices((50,), seed=1)
     (geometry.nearest_rank2(F) * target).sum().backward()
-    # |d(F v v^T)| <= |dF| + 2 s3 |dv|;
-    # |dv| <= 2 s1 |dF| max gap / (gap^2 + eps^2) = s1 |dF| / eps; eps = 1e-6 s1^2.
+    # |d(F v v^T)| <= |dF| + 2 s3 |dv|; |dv| <= 2 s1 |dF| max gap / (gap^2 + eps^2) = s1 |dF| / eps; eps = 1e-6 s1^2.
     assert F.grad.isfinite().all()
     assert F.grad.norm(dim=(1, 2)).max() <= (1 + 2e6) * target.norm(dim=(1, 2)).max()
 

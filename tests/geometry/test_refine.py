@@ -85,9 +85,8 @@ def test_attached_step_has_the_gradient_of_the_optimum(loss: str, outliers: int)
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_gradients_are_those_of_the_optimum(loss: str) -> None:
-    """Finite differences of the optimum.
-    Points have a noise of 3 px at a focal length of 1000 px, so that Gauss and Newton's Hessian would not do: it misses
-    these gradients by 2 % and more."""
+    """Finite differences of the optimum. Points have a noise of 3 px at a focal length of 1000 px, so that Gauss and
+    Newton's Hessian would not do: it misses these gradients by 2 % and more."""
     x0, x1, F, weight = near_scene(2, outliers=1)
     converged = refine(F, x0, x1, weight, loss=loss, scale=SCALE, iterations=40)
 

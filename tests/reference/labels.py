@@ -69,9 +69,8 @@ def share(
     K0: np.ndarray, K1: np.ndarray, sizes: tuple[tuple[int, int], tuple[int, int]], R: np.ndarray, t: np.ndarray,
     step: int, tolerance: float,
 ) -> float:  # fmt: skip
-    """The share of the pixels of image 0 with depth whose points image 1 sees at the same depth, to a tolerance.
-    A depth is a function of x and y, NaN where there is none. Pixels for which the other image has none do not
-    count."""
+    """The share of the pixels of image 0 with depth whose points image 1 sees at the same depth, to a tolerance. A
+    depth is a function of x and y, NaN where there is none. Pixels for which the other image has none do not count."""
     (h0, w0), (h1, w1) = sizes
     seen = count = 0
     for y in range(step // 2, h0, step):

@@ -84,9 +84,8 @@ def _refine(volume: np.ndarray, at: tuple[int, ...]) -> tuple[tuple[int, ...], n
 
 
 def patch(image: np.ndarray, laf: np.ndarray, size: int = 32, blur_pixels: float = 0.6, dense: int = 6) -> np.ndarray:
-    """What a camera whose pixels tile the frame sees: each pixel a Gaussian mean of dense samples of the image.
-    The Gaussian has sigma `blur_pixels` of the patch's pixels; the image is interpolated linearly, borders
-    continued."""
+    """What a camera whose pixels tile the frame sees: each pixel a Gaussian mean of dense samples of the image. The
+    Gaussian has sigma `blur_pixels` of the patch's pixels; the image is interpolated linearly, borders continued."""
     reach = 3 * blur_pixels
     steps = np.arange(-reach, reach + 1e-9, 1 / dense)
     weight = np.exp(-0.5 * (steps / blur_pixels) ** 2)

@@ -121,8 +121,7 @@ def significance(F: Points, x0: Points, x1: Points, size0: Any = None, size1: An
 
     NFA(k) = 3 (n - 7) C(n, k) C(k, 7) alpha_k^(k - 7), alpha_k the k-th smallest chance that a point at random is as
     near its epipolar line as a match's, in the image where that is more likely. Of the matches that join one cell of
-    image 0 to one cell of image 1 the median one counts, the upper one of two. Minus infinity for n < 8.
-    """
+    image 0 to one cell of image 1 the median one counts, the upper one of two. Minus infinity for n < 8."""
     if len(x0) == 0:
         return -math.inf
     chances, cells = [[0.0] * len(x0)], []

@@ -289,8 +289,7 @@ def exact_int8(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sums of int8 products in 32 bits on every processor.
 
     Without VNNI, ONNX Runtime otherwise adds them in pairs in 16 bits, where they saturate; which are pairs depends on
-    the layout.
-    """
+    the layout."""
 
     class Exact(onnxruntime.SessionOptions):  # type: ignore[misc, unused-ignore]
         def __init__(self) -> None:
