@@ -215,7 +215,7 @@ class Batch(NamedTuple):
         n, frame = len(matches.mask), np.empty(6)
         slots, flat = np.empty(n, np.int64), np.empty(9 * n)
         known = self.prior is not None, self.noise is not None, self.ambiguity is not None
-        stretch = self.stretch if residual is SAMPSON else None
+        stretch = self.stretch
         if stretch is not None and self.noise is not None:
             matches = matches._replace(noise=matches.noise / mean_stretch(stretch[i]))
         count = normalize_pair(matches, slots, flat, frame)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.epipolar import SAMPSON, Residual, mean_stretch, stretch_across
+from fmtorch.geometry.epipolar import SAMPSON, Residual, homography_stretch, mean_stretch, stretch_across
 from fmtorch.geometry.matrices import multiply
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, vector
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -157,11 +157,12 @@ def stretched(pair: Pair, J: Array) -> Pair:
 
 
 def across_lines(pair: Pair, F: Array) -> Pair:
-    """The pair whose distances count by how the points are stretched across the epipolar lines of a model (9,)."""
+    """The pair whose distances count by how points are stretched across a model's (9,) lines, or towards its points."""
     if pair.stretch is None:
         return pair
     J = pair.table[STRETCH + 1 :].T.reshape(-1, 2, 2, 2)
-    return _stretched_by(pair, np.sqrt(stretch_across(F, pair.points, J)))
+    stretch = stretch_across if pair.residual is SAMPSON else homography_stretch
+    return _stretched_by(pair, np.sqrt(stretch(F, pair.points, J)))
 
 
 def _stretched_by(pair: Pair, stretch: Array) -> Pair:

@@ -34,6 +34,24 @@ def stretch_across(F: Any, points: Any, J: Any) -> Any:
     for k, (a, b) in enumerate((line0, line1)):
         u, v = (a * J[..., k, 0, i] + b * J[..., k, 1, i] for i in (0, 1))
         there, here = there + (u * u + v * v), here + (a * a + b * b)
+    return _ratio(there, here)
+
+
+def homography_stretch(H: Any, points: Any, J: Any) -> Any:
+    """The same of Sampson's distance of a homography (9,), in the direction of the residual ``e = W x1 - (X, Y)``: of
+    ``e^T C^-1 e``, C the covariance of e by unit noise of points, and of photographs' points. Arrays."""
+    h, x = H.reshape(3, 3), points[2:].T
+    X, Y, W = h[:, :2] @ points[:2] + h[:, 2:]
+    e = W[:, None] * x - np.stack([X, Y], 1)
+    by_points = np.stack([x[..., None] * h[2, :2] - h[:2, :2], W[:, None, None] * np.eye(2)], 1)
+    squared = []
+    for D in (by_points, by_points @ J):
+        (a, b), (_, d) = np.moveaxis((D @ D.swapaxes(2, 3)).sum(1), 0, -1)
+        squared.append((d * e[:, 0] ** 2 - 2 * b * e[:, 0] * e[:, 1] + a * e[:, 1] ** 2) / (a * d - b * b))
+    return _ratio(*squared)
+
+
+def _ratio(there: Any, here: Any) -> Any:
     none = (here == 0) | (there == 0)
     return (there + none) / (here + none)
 

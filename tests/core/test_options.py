@@ -148,21 +148,11 @@ F = torch.rand(3, 3)
 
 
 def distance(
-    F: Float[Tensor, "*#batch 3 3"],
-    x: Float[Tensor, "*#batch n 2"],
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    key: Int[Tensor, "*#batch"] | None = None,
-    *,
-    size: Real[Tensor, "*#batch 2"] | None = None,
-    scale: float | Tensor = 1.0,
-    steps: int = 3,
-    taus: Sequence[float] = (1.0,),
-    counts: Sequence[int] = (1,),
-    border: Literal["a", "b"] = "a",
-    name: str = "",
-    cap: bool = True,
-    weigh: Callable[[Tensor], Tensor] | None = None,
-) -> Any:
+    F: Float[Tensor, "*#batch 3 3"], x: Float[Tensor, "*#batch n 2"], mask: Bool[Tensor, "*#batch n"] | None = None,
+    key: Int[Tensor, "*#batch"] | None = None, *, size: Real[Tensor, "*#batch 2"] | None = None,
+    scale: float | Tensor = 1.0, steps: int = 3, taus: Sequence[float] = (1.0,), counts: Sequence[int] = (1,),
+    border: Literal["a", "b"] = "a", name: str = "", cap: bool = True, weigh: Callable[[Tensor], Tensor] | None = None,
+) -> Any:  # fmt: skip
     return dict(locals())
 
 

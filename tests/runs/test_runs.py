@@ -391,18 +391,12 @@ def test_without_git_the_sources_tell(package: Path, monkeypatch: pytest.MonkeyP
 
 
 OWN = {
-    "lone.py": "import helper\nfrom folder import inner\nimport json, numpy",
-    "helper.py": "from folder.inner import x",
-    "folder/inner.py": "x = 1",
-    "folder/unused.py": "",
-    "other.py": "",
-    "parts/__init__.py": "",
-    "parts/common.py": "import lone",
+    "lone.py": "import helper\nfrom folder import inner\nimport json, numpy", "helper.py": "from folder.inner import x",
+    "folder/inner.py": "x = 1", "folder/unused.py": "", "other.py": "",
+    "parts/__init__.py": "", "parts/common.py": "import lone", "parts/broken.py": "",
     "parts/deep/stage.py": "from ..common import lone\nfrom . import near\nimport fmtorch.core.types",
-    "parts/deep/near.py": "",
-    "parts/deep/below/far.py": "",
-    "parts/broken.py": "",
-}
+    "parts/deep/near.py": "", "parts/deep/below/far.py": "",
+}  # fmt: skip
 FOLLOWED = {
     "lone": {"lone.py", "helper.py", "folder/inner.py"},
     "parts.deep.stage": {

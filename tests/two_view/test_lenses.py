@@ -18,6 +18,7 @@ from tests.reference import lenses as division
 SIZE = (480, 640)
 SIZES = {"size0": SIZE, "size1": SIZE}
 FISHEYE = Lens(400.0, 410.0, 321.0, 238.0, "OPENCV_FISHEYE", (0.02, -0.01, 0.005, -0.002))
+WIDE = Lens(300.0, 310.0, 700.0, 690.0, "OPENCV_FISHEYE", (0.01, -0.002, 0.0, 0.0))
 RADIAL = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (-0.15,))
 PINHOLE = Lens(512.0, 512.0, 319.5, 239.5)
 FOLDED = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (-20.0,))
@@ -39,17 +40,18 @@ def photographs(lens0: Lens, lens1: Lens, seed: int = 1) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def surroundings(seed: int, lens: Lens, nearest: float, farthest: float) -> tuple[Array, Array, Array, Array]:
-    """Matches of what is all around, at so many degrees from the axis of a fish-eye, a fifth of them wrong; R and t."""
+def surroundings(seed: int, nearest: float, farthest: float, flat: bool = False) -> tuple[Array, Array, Array, Array]:
+    """Matches of what is all around, or flat, at so many degrees from `WIDE`'s axis, a fifth of them wrong; R and t."""
     rng, low, high = np.random.default_rng(seed), *np.cos(np.radians([farthest, nearest]))
     z, azimuth = rng.uniform(low, high, 900), rng.uniform(0, 2 * np.pi, 900)
-    X = np.c_[np.sqrt(1 - z * z)[:, None] * np.c_[np.cos(azimuth), np.sin(azimuth)], z] * rng.uniform(3, 12, (900, 1))
+    X = np.c_[np.sqrt(1 - z * z)[:, None] * np.c_[np.cos(azimuth), np.sin(azimuth)], z]
+    X *= 4 / z[:, None] if flat else rng.uniform(3, 12, (900, 1))
     R, t = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix(), rng.normal(size=3)
     t /= np.linalg.norm(t)
     Y = X @ R.T + t
     angle = np.degrees(np.arctan2(np.hypot(Y[:, 0], Y[:, 1]), Y[:, 2]))
     X, Y = (Z[(nearest < angle) & (angle < farthest)][:300] for Z in (X, Y))
-    ends = [lens.distort(Z[:, :2] / Z[:, 2:] @ lens.K[:2, :2] + lens.K[:2, 2], Z[:, 2] < 0) for Z in (X, Y)]
+    ends = [WIDE.distort(Z[:, :2] / Z[:, 2:] @ WIDE.K[:2, :2] + WIDE.K[:2, 2], Z[:, 2] < 0) for Z in (X, Y)]
     x0, x1 = (x + rng.normal(0, 0.5, x.shape) for x in ends)
     return x0, np.r_[rng.permutation(x1[:60]), x1[60:]], R, t
 
@@ -57,21 +59,35 @@ def surroundings(seed: int, lens: Lens, nearest: float, farthest: float) -> tupl
 @pytest.mark.parametrize(("nearest", "farthest"), [(0, 75), (0, 100), (80, 100), (95, 120)])
 def test_rays_beyond_90_degrees(nearest: float, farthest: float) -> None:
     """In front or behind: the rotation and the direction, with its sign, of nine scenes of ten, and most inliers."""
-    lens = Lens(300.0, 310.0, 700.0, 690.0, "OPENCV_FISHEYE", (0.01, -0.002, 0.0, 0.0))
-    scenes = [surroundings(seed, lens, nearest, farthest) for seed in range(10)]
-    together = fmtorch.find_essential(
-        [x0 for x0, *_ in scenes], [x1 for _, x1, *_ in scenes], lens=lens, pair_type=True
-    )
+    scenes = [surroundings(seed, nearest, farthest) for seed in range(10)]
+    together = fmtorch.find_essential([s[0] for s in scenes], [s[1] for s in scenes], lens=WIDE, pair_type=True)
     right = []
     for i, (x0, x1, R, t) in enumerate(scenes):
         pose = together[i]
         if i < 3:
-            assert torch.equal(pose.R, fmtorch.find_essential(x0, x1, lens=lens).R)
+            assert torch.equal(pose.R, fmtorch.find_essential(x0, x1, lens=WIDE).R)
         turned = np.degrees(Rotation.from_matrix(R.T @ pose.R[0].numpy()).magnitude())
         off = np.degrees(np.arccos(np.clip(t @ pose.t[0].numpy(), -1, 1)))
         seen = pose.inliers[0, 60:].float().mean() > 0.95 and pose.pair_type == ("general",)
         right.append(turned < 0.3 and off < 1.5 and seen)
     assert sum(right) >= 9
+
+
+def test_distances_to_planes_are_of_the_photographs() -> None:
+    """Of a fish-eye of 150 degrees: corrections of the photographs' points, by differences; all right ones agree."""
+    x0, x1, _, _ = surroundings(2, 0, 75, flat=True)
+    plane = fmtorch.find_homography(x0, x1, lens=WIDE)
+
+    def missed(x: Array) -> Array:
+        y0, y1 = (torch.from_numpy(undistorted_points(WIDE, end)) for end in (x[:, :2], x[:, 2:]))
+        h0 = torch.nn.functional.pad(y0, (0, 1), value=1.0) @ plane.H[0].mT
+        return (h0[:, :2] - h0[:, 2:] * y1).numpy()
+
+    x = np.c_[x0, x1]
+    J = np.stack([missed(x + step) - missed(x - step) for step in 0.005 * np.eye(4)], -1) * 100
+    squared = (missed(x) * np.linalg.solve(J @ J.swapaxes(1, 2), missed(x)[..., None])[..., 0]).sum(-1)
+    assert plane.inliers[0].tolist() == (squared <= 2.5**2).tolist()
+    assert plane.inliers[0, 60:].all()
 
 
 def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
