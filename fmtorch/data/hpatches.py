@@ -31,8 +31,7 @@ class HPatchesPairs(HeldPairs):
         short_side: px, to which the shorter side of each image is resized when read, and H with it; None: not at all.
 
     A pair's family is illumination or viewpoint, its scene the sequence. A pair with a missing image or without a sound
-    homography has a `problem`. Raises DataError where root holds no sequence, or not one that was named.
-    """
+    homography has a `problem`. Raises DataError where root holds no sequence, or not one that was named."""
 
     name = "hpatches"
     model = "homography"

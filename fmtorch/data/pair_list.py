@@ -206,8 +206,7 @@ class PairList(HeldPairs):
         origin: the first pixel's centre in K; None: 0.5 for glue-factory's lists and MegaDepth's ``.npz``, otherwise 0.
 
     A pair's family is the list, its scene the first folder in which the names of the list differ. A pair with a missing
-    image or without a sound camera has a `problem`. Raises DataError, naming file and line, for other lists.
-    """
+    image or without a sound camera has a `problem`. Raises DataError, naming file and line, for other lists."""
 
     name = "pair_list"
 

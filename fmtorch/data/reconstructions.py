@@ -40,8 +40,7 @@ def colmap_pairs(
 
     Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
     point and size (`undistorted`). Principal points are lowered by COLMAP's half pixel. An image of another size than
-    its camera's is refused when it is read. Raises DataError for a missing or damaged model.
-    """
+    its camera's is refused when it is read. Raises DataError for a missing or damaged model."""
     home, scene_folders = _scene_folders(root, split, sequences, model)
     model_folders = [_model_folder(folder, model) for folder in scene_folders]
     read, sources = [], []

@@ -110,8 +110,7 @@ def tum_pairs(
 
     The images of freiburg1 and freiburg2 are undistorted when they are read; those of freiburg3 are so already. The
     pose of a frame is interpolated between the two around it (linearly, and along the great circle); frames farther
-    than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for damaged files.
-    """
+    than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for damaged files."""
     home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
     folders = scenes.folders(home, scenes.chosen("tum", split, sequences, there), "a folder for each sequence")

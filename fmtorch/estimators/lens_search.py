@@ -309,8 +309,7 @@ def squared_px(model: Array, lens: Array, pair: Pair) -> Array:
 
 def _noise_scale(fit: LensFit, pair: Pair) -> float:
     """From which Sampson distance on matches do not count, px, by the noise of those that lie within the start's."""
-    r2 = squared_px(fit.F, fit.lens, pair) / np.square(pair.noises)
-    return noise_scale(r2, pair, FitScale(), START_SCALE_PX)
+    return noise_scale(squared_px(fit.F, fit.lens, pair) / np.square(pair.noises), pair, FitScale(), START_SCALE_PX)
 
 
 def lens_prior(lens: Lens) -> LensPrior:

@@ -149,8 +149,7 @@ class Ransac:
         ValueError: for an unknown part or option, and for one that would have no effect, such as a threshold where
             neither score nor inliers have one.
 
-    Memory: for each thread some 300 bytes a match of one pair, and 1 MB of models.
-    """
+    Memory: for each thread some 300 bytes a match of one pair, and 1 MB of models."""
 
     def __init__(
         self,

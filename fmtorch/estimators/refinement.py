@@ -254,10 +254,9 @@ class Adaptive(NoFit):
 
     One threshold does not suit all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar
     lines, those of a hand-held telephone within one. A threshold for the worst lets wrong matches into the fit of the
-    best.
-    Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is 1.4826
-    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; `FitScale`
-    says what they are of homographies."""
+    best. Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is
+    1.4826 times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that;
+    `FitScale` says what they are of homographies."""
 
     gradient, weighted = "optimum", True
 

@@ -261,9 +261,8 @@ class SaturatedGains(SummedGains):
 
     Saturates where matches crowd, so that a model which explains the whole image beats one that explains a single
     textured plane. The narrow peak of g tells exact models from those nearby, and its tail lets one scale serve scenes
-    of different noise. The grid is that of the box around the matches of weight.
-    threshold: the scale, at which a match counts half, Sampson distance, px. preselection: the plain sum of g, for few
-    matches."""
+    of different noise. The grid is that of the box around the matches of weight. threshold: the scale, at which a match
+    counts half, Sampson distance, px. preselection: the plain sum of g, for few matches."""
 
     def __init__(self, threshold: float, prior_weighted: bool = True) -> None:
         super().__init__(threshold, prior_weighted)

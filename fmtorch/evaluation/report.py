@@ -134,8 +134,7 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
     for i in order:  # the first of every scene, then the second of every scene
         turns.append(seen.setdefault(scenes[rows[i]], 0))
         seen[scenes[rows[i]]] += 1
-    chosen = order[np.argsort(turns, kind="stable")][:count]
-    return [names[rows[i]] for i in chosen]
+    return [names[rows[i]] for i in order[np.argsort(turns, kind="stable")][:count]]
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:

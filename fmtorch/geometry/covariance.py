@@ -223,10 +223,9 @@ class LensesInPixels(NamedTuple):
 class TwoViewCovariance(NamedTuple):
     """Covariances of B pairs.
     covariance: of (omega, tau, log f0, log f1), radians and logarithms, and both lambdas if lenses are given; rows of
-    what is known are zero.
-    tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at unit Frobenius norm, in
-    pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior is not finite or has no
-    meaning; such a pair is as one without matches."""
+    what is known are zero. tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at
+    unit Frobenius norm, in pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior
+    is not finite or has no meaning; such a pair is as one without matches."""
 
     covariance: Float[Tensor, "b m m"]
     tangent: Float[Tensor, "b 3 2"]

@@ -259,8 +259,7 @@ def without_origin(model: Any) -> Any:
     """An ONNX model without the notes and properties of its graph, of nodes and values, and of the graphs within."""
     import onnx_ir.passes.common
 
-    cleared = onnx_ir.passes.common.ClearMetadataAndDocStringPass()(onnx_ir.from_proto(model))
-    return onnx_ir.to_proto(cleared.model)
+    return onnx_ir.to_proto(onnx_ir.passes.common.ClearMetadataAndDocStringPass()(onnx_ir.from_proto(model)).model)
 
 
 def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:

@@ -158,8 +158,7 @@ def transfer_error(
     ahead = there[..., 2] > 0
     at = there[..., :2] / np.where(ahead, there[..., 2], 1.0)[..., None]
     error = np.where(ahead, np.hypot(*np.moveaxis(at - partner, -1, 0)), np.inf)
-    kindest = np.where(np.isnan(depth), np.inf, error).min(0)
-    return np.where(np.isnan(depth).all(0), np.nan, kindest)
+    return np.where(np.isnan(depth).all(0), np.nan, np.where(np.isnan(depth), np.inf, error).min(0))
 
 
 MIN_INLIERS = 16  # no crop or ratio threshold that would leave fewer; twice what the eight-point algorithm needs
@@ -233,8 +232,7 @@ def thinned_counts(inliers: int, outliers: int, share: float) -> tuple[int, int]
     """How many inliers and outliers to keep so that `share` are inliers, dropping only the one or the other.
     At least `MIN_INLIERS` inliers are kept, and `MIN_MATCHES` matches, where there are so many."""
     if share * (inliers + outliers) < inliers:
-        wanted = round(outliers * share / (1 - share))
-        return min(inliers, max(wanted, MIN_INLIERS)), outliers
+        return min(inliers, max(round(outliers * share / (1 - share)), MIN_INLIERS)), outliers
     wanted = round(inliers * (1 - share) / share) if share > 0 else outliers
     return inliers, min(outliers, max(wanted, MIN_MATCHES - inliers))
 

@@ -69,8 +69,7 @@ class Optimisation:
 
     def factor(self, step: int) -> float:
         """What the learning rate is multiplied by at a step."""
-        left = (self.steps - step) / max(self.decay * self.steps, 1)
-        return min(1.0, max(left, 0.0))
+        return min(1.0, max((self.steps - step) / max(self.decay * self.steps, 1), 0.0))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -211,8 +211,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "c b n"], slots: Slots) -> Float[Tensor, "c b n"]:
         y = self.norm0(self.linear0(x), slots)
-        y = self.norm1(self.linear1(y), slots)
-        return x + y  # type: ignore[no-any-return]
+        return x + self.norm1(self.linear1(y), slots)  # type: ignore[no-any-return]
 
 
 class NormedPerceptron(nn.Module):

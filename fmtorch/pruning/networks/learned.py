@@ -34,8 +34,7 @@ def learned_file(name: str | Path, runtime: str) -> Path:
 
 def stated_network(network: nn.Module) -> dict[str, Any]:
     """What a file states of its network, as JSON gives it back: its class, and its `options` where it has them."""
-    said = {"class": type(network).__name__, "options": getattr(network, "options", None)}
-    return json.loads(json.dumps(said))  # type: ignore[no-any-return]
+    return json.loads(json.dumps({"class": type(network).__name__, "options": getattr(network, "options", None)}))  # type: ignore[no-any-return]
 
 
 def metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -71,8 +71,7 @@ class OrderAwareContext(nn.Module):
         share = slots.softmax(self.linear0(self.norm0(x, slots)))
         y, nodes = torch.einsum("cbn,kbn->cbk", x, share), slots.columns(len(share))
         y = layers.through(self.filters, y, nodes)
-        share = torch.softmax(self.linear1(self.norm1(x, slots)), 0)
-        return slots.clean(torch.einsum("cbk,kbn->cbn", y, share))
+        return slots.clean(torch.einsum("cbk,kbn->cbn", y, torch.softmax(self.linear1(self.norm1(x, slots)), 0)))
 
 
 class Stage(nn.Module):
