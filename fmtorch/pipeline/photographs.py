@@ -221,7 +221,7 @@ def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scale
     lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked."""
     both = zip(lenses, scales, strict=True)
     first, second = (None if lens is None else lens.scaled(*scale.tolist()) for lens, scale in both)
-    return two_view.undistorted_matches(c, [(first, second)]).derived(noise=c.noise)
+    return two_view.undistorted_matches(c, [(first, second)])
 
 
 def evenly_reduced(

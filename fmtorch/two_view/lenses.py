@@ -108,7 +108,7 @@ class CalibratedLenses:
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Correspondences:
     """The matches of a batch as pinholes of the same K would have them; one that a pinhole does not see is masked."""
     seen, behind = matches_in_sight(c, lenses)
-    return seen.derived(mask=seen.mask & ~behind.any(-1), stretch=None)
+    return seen.derived(mask=seen.mask & ~behind.any(-1))
 
 
 def matches_in_sight(c: Correspondences, lenses: Sequence[Lenses]) -> tuple[Correspondences, Bool[Tensor, "b n 2"]]:
