@@ -21,14 +21,14 @@ from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit, LensFit
 from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Weighted, add_products, assemble, in_rows, robust
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, rows_of, summation
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
-from fmtorch.jit.lanes import LANES, added, fill, load, store, where
+from fmtorch.jit.lanes import LANES, load, store, where
 
 MIN_DEPTH = 0.1  # of a point beyond the corner
-PARAMETERS = 9  # five rotations, two focal lengths, two lenses
+PARAMETERS, LENS = 9, 7  # five rotations, two focal lengths, two lenses, of which LENS is the first
 ROWS = 12  # of a match: derivatives by nine entries and two lenses, and the residual
 
 
@@ -44,7 +44,8 @@ class LensPrior(NamedTuple):
 
 class LensOptimum(NamedTuple):
     """Of k candidates, as `Optimum`: cameras, lens (k, 2), models F (k, 9) from the principal points, costs (k,), and
-    their derivatives."""
+    their derivatives; at the end also inverses of the Hessians, logarithms of their evidence (k,) up to a constant, and
+    standard deviations of lenses (k, 2)."""
 
     axes: F8x4
     focal: F8x2
@@ -53,6 +54,9 @@ class LensOptimum(NamedTuple):
     cost: F8x1
     gradient: F8x2
     hessian: F8x3
+    inverse: F8x3
+    evidence: F8x1
+    deviation: F8x2
 
 
 def half_diagonals(pair: Pair) -> Array:
@@ -80,15 +84,12 @@ def undistorted(pair: Pair, lens: Array) -> Pair:
 class _Data(NamedTuple):
     """tangents: (k, 9, LANES), of the cameras; products: (ROWS, ROWS), for the work."""
 
-    rows: Array
-    loss: int
-    table: Array
+    rows: Rows
     images: Images
-    diagonal: Array
     prior: LensPrior
     limits: Limits
-    tangents: Array
-    products: Array
+    tangents: F8x3
+    products: F8x2
 
 
 @kernel
@@ -99,12 +100,45 @@ def minimise_with_lenses(
     matches: of the photographs, from the principal points."""
     k = len(state.cost)
     axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, PARAMETERS, PARAMETERS))
-    trial = LensOptimum(axes, matrix(k, 2), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, PARAMETERS), hessian)
-    rows, products = in_rows(matches.points, matches.weight, matches.s2), matrix(ROWS, ROWS)
-    data = _Data(
-        rows, matches.loss, matches.table, images, prior.diagonal, prior, limits, np.zeros((k, 9, LANES)), products
-    )
+    trial = LensOptimum(
+        axes, matrix(k, 2), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, PARAMETERS), hessian,
+        state.inverse, state.evidence, state.deviation,
+    )  # fmt: skip
+    rows, tangents = rows_of(matches, ROWS), np.zeros((k, 9, LANES))
+    data = _Data(rows, images, prior, limits, tangents, matrix(ROWS, ROWS))
     _minimise(data, state, trial, np.full(k, posterior.FIRST_DAMPING), limits.iterations, limits.tolerance)
+    own = 1 if prior.shared else 2
+    normaliser = 0.0
+    for i in range(own):
+        normaliser += logarithm_kernel(prior.precision[i])
+    for i in range(k):
+        state.evidence[i] = -state.cost[i] - _inverted(state.hessian[i], state.inverse[i]) / 2 + normaliser / 2
+        for j in range(2):
+            place = LENS + j * (own - 1)
+            state.deviation[i, j] = math.sqrt(abs(state.inverse[i, place, place]))
+
+
+@inner
+def _inverted(A: Array, out: Array) -> Any:
+    """The inverse of A (n, n) -> out, and log |det A|; not numbers where there is none."""
+    n, rows, logarithm = len(A), matrix(len(A), len(A)), 0.0
+    for i in range(n):
+        for c in range(n):
+            rows[i, c], out[i, c] = A[i, c], 1.0 if i == c else 0.0
+    for i in range(n):
+        pivot = rows[i, i]
+        pivot = pivot if abs(pivot) < math.inf and pivot != 0 else math.nan
+        logarithm += logarithm_kernel(abs(pivot))
+        for c in range(n):
+            rows[i, c] /= pivot
+            out[i, c] /= pivot
+        for r in range(n):
+            factor = rows[r, i]
+            if r != i:
+                for c in range(n):
+                    rows[r, c] -= factor * rows[i, c]
+                    out[r, c] -= factor * out[i, c]
+    return logarithm
 
 
 @kernel(holds_gil=True)
@@ -113,7 +147,7 @@ def photograph_residuals(F: F8x1, lens: F8x1, diagonal: F8x1, points: F8x2, out:
     n, J = points.shape[1], matrix(ROWS, LANES)
     rows, r2 = in_rows(points, np.ones(n), np.ones(n)), matrix(1, LANES)
     for first in range(0, n, LANES):
-        _, value = _linearised(F, lens, diagonal, rows, first // LANES * MATCH, J)
+        _, value = _linearised((F, lens, diagonal), rows, first // LANES * MATCH, J, 0)
         store(r2, 0, value)
         for i in range(min(LANES, n - first)):
             out[first + i] = r2[0, i]
@@ -125,7 +159,7 @@ def _evaluate(state: LensOptimum, data: _Data, derivatives: bool) -> None:
     posterior.camera_models(state.axes, state.focal, images.longest, images.prior.shared, state.F, data.tangents)
     work, W = vector(5), np.zeros((ROWS - 1, PARAMETERS))
     for k in range(len(state.cost)):
-        cost = _summed(state.F[k], state.lens[k], data, derivatives) * data.limits.precision / 2
+        cost = summed_with_lenses(state.F[k], state.lens[k], data, derivatives) * data.limits.precision / 2
         cost += focal_cost(state.focal[k], images.prior, work)
         for i in range(1 if data.prior.shared else 2):
             away = state.lens[k, i] - data.prior.mean[i]
@@ -135,28 +169,18 @@ def _evaluate(state: LensOptimum, data: _Data, derivatives: bool) -> None:
             _derivatives(state, data, k, work, W)
 
 
-@inner
-def _summed(F: Array, lens: Array, data: _Data, derivatives: bool) -> Any:
+@kernel
+def summed_with_lenses(F: F8x1, lens: F8x1, data: _Data, derivatives: bool) -> float:
     """The robust cost of one candidate; the products of derivatives and residuals -> data.products."""
-    sums, work = matrix(ROWS * (ROWS + 1) // 2, LANES), matrix(3, LANES)
-    J, scaled = matrix(ROWS, LANES), matrix(ROWS, LANES)
-    costs = fill(0.0)
-    for q in range(len(sums)):
-        store(sums, q, costs)
-    for row in range(0, len(data.rows), MATCH):
-        inverse, r2 = _linearised(F, lens, data.diagonal, data.rows, row, J)
-        share, slope = robust(r2, load(data.rows, row + 5), data.loss, data.table, work)
-        costs += share * load(data.rows, row + 4)
-        if derivatives:
-            add_products(J, inverse * (load(data.rows, row + 4) * slope), scaled, sums)
-    if derivatives:
-        assemble(sums, data.products)
-    return added(costs)
+    cost: float = _summed((F, lens, data.prior.diagonal), data.rows, derivatives, data.products)
+    return cost
 
 
 @inner
-def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J: Array) -> tuple[Any, Any]:
-    """Derivatives and residual of LANES matches -> J (ROWS, LANES); inverse squared slopes, squared distances."""
+def _linearised(model: tuple[Array, Array, Array], rows: Array, row: int, J: Array, at: int) -> tuple[Any, Any]:
+    """Derivatives and residual of LANES matches -> ROWS rows of J; inverse squared slopes, squared distances.
+    model: F (9,), lenses, and half diagonals of the images."""
+    f, lens, diagonal = model
     l0, l1 = lens[0] / (diagonal[0] * diagonal[0]), lens[1] / (diagonal[1] * diagonal[1])
     x0, y0, x1, y1 = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     r0, r1 = x0 * x0 + y0 * y0, x1 * x1 + y1 * y1
@@ -173,13 +197,16 @@ def _linearised(f: Array, lens: Array, diagonal: Array, rows: Array, row: int, J
     c0, c1 = t0 * (2 * l0), t1 * (2 * l1)
     u, v, w = x1 - c * a1, y1 - c * b1, w1 - c * c1
     p, q, s = c * a0, c * b0, c * c0
-    store(J, 0, (u * x0 - x1 * p, u * y0 - x1 * q, u * w0 - x1 * s))
-    store(J, 3, (v * x0 - y1 * p, v * y0 - y1 * q, v * w0 - y1 * s))
-    store(J, 6, (w * x0 - w1 * p, w * y0 - w1 * q, w * w0 - w1 * s))
-    store(J, 9, r0 * s1 - c * (2.0 * s1 * t0 + r0 * (a1 * f[2] + b1 * f[5] + c1 * f[8])))
-    store(J, 10, (r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])), e))
+    store(J, at, (u * x0 - x1 * p, u * y0 - x1 * q, u * w0 - x1 * s))
+    store(J, at + 3, (v * x0 - y1 * p, v * y0 - y1 * q, v * w0 - y1 * s))
+    store(J, at + 6, (w * x0 - w1 * p, w * y0 - w1 * q, w * w0 - w1 * s))
+    store(J, at + 9, r0 * s1 - c * (2.0 * s1 * t0 + r0 * (a1 * f[2] + b1 * f[5] + c1 * f[8])))
+    store(J, at + 10, (r1 * s0 - c * (2.0 * s0 * t1 + r1 * (a0 * f[6] + b0 * f[7] + c0 * f[8])), e))
     r2 = e * c
     return inverse, where(r2 == r2, r2, math.nan)
+
+
+_summed = summation(_linearised, ROWS)
 
 
 @inner
@@ -189,7 +216,7 @@ def _derivatives(state: LensOptimum, data: _Data, k: int, focal: Array, W: Array
     for q in range(9):
         for i in range(7):
             W[q, i] = data.tangents[k, q, i]
-    W[9, 7], W[10, 7 if prior.shared else 8] = 1 / data.diagonal[0] ** 2, 1 / data.diagonal[1] ** 2
+    W[9, 7], W[10, 7 if prior.shared else 8] = 1 / prior.diagonal[0] ** 2, 1 / prior.diagonal[1] ** 2
     for i in range(PARAMETERS):
         total = 0.0
         for q in range(ROWS - 1):
@@ -237,7 +264,6 @@ _minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, relative=Fals
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one
 OWN_STARTS = (*STARTS, (0.0, -0.2), (-0.2, 0.0))  # where each has its own
 TAIL_DEVIATION = 0.15  # of an unknown lens that is not straight
-LENS = 7  # the first of the lenses among PARAMETERS
 # A Newton step and an optimum near pinholes that make these suspicious, also in standard deviations at START_SCALE_PX,
 # and an optimum that is suggested. On castle-P19 and fox these suggest a lens for 1 of 172 pairs where there is none,
 # and where it is -0.1 for 76 of the 101 pairs that have 100 right matches across half of the images.
@@ -248,31 +274,6 @@ START_SCALE_PX = 3.0  # beyond which matches do not count where the lens may be 
 START_ITERATIONS, ITERATIONS = 12, 8
 
 
-@kernel(holds_gil=True)
-def inverted(A: F8x2, out: F8x2) -> float:
-    """The inverse of A (n, n) -> out, and log |det A|; infinite and not a number where there is none."""
-    n, rows, logarithm = len(A), A.copy(), 0.0
-    for i in range(n):
-        for c in range(n):
-            out[i, c] = 1.0 if i == c else 0.0
-    for i in range(n):
-        pivot = rows[i, i]
-        if not abs(pivot) < math.inf or pivot == 0:
-            out[:] = math.inf
-            return math.nan
-        logarithm += logarithm_kernel(abs(pivot))
-        for c in range(n):
-            rows[i, c] /= pivot
-            out[i, c] /= pivot
-        for r in range(n):
-            factor = rows[r, i]
-            if r != i:
-                for c in range(n):
-                    rows[r, c] -= factor * rows[i, c]
-                    out[r, c] -= factor * out[i, c]
-    return logarithm
-
-
 def fit_with_lenses(
     cameras: Cameras, lens: Array, prior: LensPrior, pair: Pair, scale_px: float, iterations: int
 ) -> list[LensFit]:  # fmt: skip
@@ -280,23 +281,18 @@ def fit_with_lenses(
     scale_px: from which on matches do not count; of the pair as it was photographed."""
     k, images, own = len(lens), images_of(pair), cameras.copy()
     F, cost, gradient, hessian = (np.empty((k, *[PARAMETERS] * n)) for n in (1, 0, 1, 2))
-    out = LensOptimum(*own, lens.copy(), F, cost, gradient, hessian)
-    limits = Limits(_precision(scale_px, pair), iterations, FOCAL_TOLERANCE)
+    out = LensOptimum(
+        *own, lens.copy(), F, cost, gradient, hessian, np.empty_like(hessian), np.empty(k), np.empty((k, 2))
+    )
     prior = prior._replace(diagonal=half_diagonals(pair))
+    limits = Limits(_precision(scale_px, pair), iterations, FOCAL_TOLERANCE)
     minimise_with_lenses(out, centred(pair, scale_px), images, prior, limits)
     F = np.empty((k, 9))
     translate(out.F, images.offset, F)
     F /= np.sqrt((F * F).sum(1, keepdims=True))
-    fits = []
-    for i in range(k):
-        inverse = np.empty((PARAMETERS, PARAMETERS))
-        determinant = inverted(out.hessian[i], inverse)
-        normaliser = sum(float(logarithm_kernel(p)) for p in prior.precision[: 1 if prior.shared else 2])
-        evidence = -float(out.cost[i]) - determinant / 2 + normaliser / 2
-        deviation = np.sqrt(np.abs(inverse.diagonal()[[LENS, LENS if prior.shared else LENS + 1]]))
-        at = float(out.cost[i]), out.gradient[i], out.hessian[i]
-        fits.append(LensFit(own.of(i), out.lens[i], F[i], *at, evidence, inverse, deviation))
-    return fits
+    numbers = cost.tolist(), out.evidence.tolist()
+    each = zip(out.lens, F, numbers[0], gradient, hessian, numbers[1], out.inverse, out.deviation, strict=True)
+    return [LensFit(own.of(i), *fit) for i, fit in enumerate(each)]
 
 
 def squared_px(model: Array, lens: Array, pair: Pair) -> Array:
@@ -318,8 +314,8 @@ def lens_prior(lens: Lens) -> LensPrior:
     return LensPrior(np.array(lens.means), 1 / np.square(deviation), lens.shared)
 
 
-STRAIGHT = Lens((0.0, 0.0), (0.0, 0.0), True)
-SHARED = Lens((0.0, 0.0), (math.inf, math.inf), True)
+STRAIGHT = lens_prior(Lens((0.0, 0.0), (0.0, 0.0), True))
+SHARED = lens_prior(Lens((0.0, 0.0), (math.inf, math.inf), True))
 
 
 def lenses_of(pair: Pair, search: FocalSearch) -> Array:
@@ -337,9 +333,9 @@ def lenses_of(pair: Pair, search: FocalSearch) -> Array:
     scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
     best = _best(fits, prior, pair, scale)
     if unknown.all():
-        straight, none = lens_prior(STRAIGHT), np.zeros(2)
-        pinholes = [_from(fit._replace(lens=none), straight, pair, START_SCALE_PX, START_ITERATIONS) for fit in fits]
-        if not best.evidence > _best(pinholes, straight, pair, scale).evidence:
+        none = np.zeros(2)
+        pinholes = [_from(fit._replace(lens=none), STRAIGHT, pair, START_SCALE_PX, START_ITERATIONS) for fit in fits]
+        if not best.evidence > _best(pinholes, STRAIGHT, pair, scale).evidence:
             return mean
     return best.lens
 
@@ -397,8 +393,7 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
     if cameras is None:
         cameras = posterior.no_cameras(1)
         posterior.nearest_cameras(fit.F[None], images_of(pair), cameras)
-    none, unknown, straight = np.zeros((1, 2)), lens_prior(SHARED), lens_prior(STRAIGHT)
-    (pinholes,) = fit_with_lenses(cameras, none, unknown, pair, START_SCALE_PX, 0)
+    (pinholes,) = fit_with_lenses(cameras, np.zeros((1, 2)), SHARED, pair, START_SCALE_PX, 0)
 
     def refined(start: LensFit, prior: LensPrior) -> LensFit:
         return _from(start, prior, pair, START_SCALE_PX, START_ITERATIONS)
@@ -409,12 +404,12 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
     step = float((pinholes.inverse[LENS] * pinholes.gradient).sum())
     if not suspicious(step, float(pinholes.deviation[0])):
         return math.nan
-    near = refined(pinholes, unknown)
+    near = refined(pinholes, SHARED)
     if not suspicious(float(near.lens[0]), float(near.deviation[0])):
         return math.nan
-    fits = [near, *(refined(pinholes._replace(lens=np.array(start)), unknown) for start in STARTS[1:])]
+    fits = [near, *(refined(pinholes._replace(lens=np.array(start)), SHARED) for start in STARTS[1:])]
     scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
-    best, without = _best(fits, unknown, pair, scale), _best([refined(pinholes, straight)], straight, pair, scale)
+    best, without = _best(fits, SHARED, pair, scale), _best([refined(pinholes, STRAIGHT)], STRAIGHT, pair, scale)
     lens, deviation = float(best.lens[0]), float(best.deviation[0])
     clear = abs(lens) > max(SUGGESTED_LENS, SUGGESTED_DEVIATIONS * deviation)
     return lens if clear and best.evidence - without.evidence > SUGGESTED_GAIN else math.nan

@@ -198,9 +198,9 @@ class Ransac:
         self.select = refinement.BestScore(self.score)
         if choice is not None:
             own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
-            at_noise = functools.partial(_at_noise, choice.score, own)
-            first: scores.Score = part("score", choice.score, threshold=choice.scale)
-            self.select = refinement.BestScore(first, at_noise if choice.own_noise else None)
+            first: Any = part("score", choice.score, threshold=choice.scale)
+            scaled = choice.own_noise and takes("score", choice.score, "threshold") and first.threshold == choice.scale
+            self.select = refinement.BestScore(first, functools.partial(_at_noise, first, own) if scaled else None)
         self.focal = self._focal_search(stage(focal, Focal), choice)
 
     def _focal_search(self, options: Focal | None, choice: refinement.Select | None) -> FocalSearch | None:
@@ -338,12 +338,9 @@ def searched(pair: Pair) -> Pair:
     return pair if count >= pair.count else pair.take(np.arange(count) * pair.count // count)
 
 
-def _at_noise(score: Any, own: FitScale, F: Array, pair: Pair) -> scores.Score:
+def _at_noise(score: scores.SummedGains, own: FitScale, F: Array, pair: Pair) -> scores.Score:
     """A score at the noise of a pair near a model (9,)."""
-    at: scores.Score = part(
-        "score", score, threshold=noise_scale(squared_in_noises(F, pair), pair, own, own.largest_px)
-    )
-    return at
+    return score.at(noise_scale(squared_in_noises(F, pair), pair, own, own.largest_px))
 
 
 class CoarseToFine:
@@ -390,7 +387,7 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (  # of an estimator of fundamental 
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
     with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
-    posterior.minimise, lens_search.inverted, lens_search.minimise_with_lenses,
+    posterior.minimise, lens_search.summed_with_lenses, lens_search.minimise_with_lenses,
 )  # fmt: skip
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (

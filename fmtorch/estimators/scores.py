@@ -12,7 +12,7 @@ from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic import smallest_but
 from fmtorch.geometry.epipolar import MATCH, SINGLES, TINY32, Residual, fill, load
 from fmtorch.geometry.levenberg_marquardt import GAIN_TABLE
-from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Kernel, inner, kernel
+from fmtorch.jit.kernel import Array, F4x1, F4x2, F8x1, F8x2, I4x2, I8x1, Inner, Kernel, inner, kernel
 from fmtorch.jit.lanes import added, sqrt, store, where
 
 
@@ -94,6 +94,12 @@ class SummedGains:
             raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
         self.threshold, self.prior_weighted = float(threshold), prior_weighted
 
+    def at(self, threshold: float) -> "SummedGains":
+        """The same score at another threshold, px."""
+        other = object.__new__(type(self))
+        other.__dict__ |= vars(self) | {"threshold": threshold}
+        return other
+
     def gain(self, squared: Array) -> Array:
         """Gains in [0, 1] at squared residuals in thresholds, (models, matches) float32."""
         raise NotImplementedError(f"{type(self).__name__} must override `gain` or name a `gain_kernel`")
@@ -168,9 +174,22 @@ def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
 
 
 @functools.cache
+def row_of(residual: Residual) -> Inner[..., Any]:
+    """Squared residuals of SINGLES matches under a model f, float32, times their scale, of rows from `row` on."""
+    of_lanes = residual.of_lanes
+
+    @inner
+    def of_row(f: Array, rows: Array, row: int) -> Any:
+        x0, y0, x1, y1 = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
+        return of_lanes(f, x0, y0, x1, y1) * load(rows, row + 4)
+
+    return of_row
+
+
+@functools.cache
 def score_gains_of(residual: Residual) -> Kernel[..., None]:
     """The kernel of sums of gains for a residual."""
-    of_row = residual.of_row
+    of_row = row_of(residual)
 
     @kernel(name=f"score_gains_{residual.name}")
     def score_gains(F: F4x2, which: I8x1, rows: F4x2, gain: Gain, out: F8x1) -> None:
@@ -200,7 +219,7 @@ def score_gains_of(residual: Residual) -> Kernel[..., None]:
 @functools.cache
 def squared_residuals_of(residual: Residual) -> Kernel[..., None]:
     """The kernel of squared residuals in thresholds, for gains in NumPy."""
-    of_row = residual.of_row
+    of_row = row_of(residual)
 
     @kernel(name=f"squared_residuals_{residual.name}")
     def squared_residuals(F: F4x2, which: I8x1, rows: F4x2, out: F4x2) -> None:
@@ -253,7 +272,6 @@ def rounded(gain: Any, shift: Any) -> Any:
 # A score that saturates where matches crowd, so that no single textured plane outvotes the rest of the image
 
 GRID = 12  # cells along each side of each image
-CELL_ROWS = 2 * GRID * GRID // SINGLES
 
 
 class SaturatedGains(SummedGains):
@@ -285,28 +303,38 @@ class SaturatedGains(SummedGains):
 @functools.cache
 def score_saturated_of(residual: Residual) -> Kernel[..., None]:
     """The kernel of saturated gains for a residual."""
-    of_row = residual.of_row
+    of_lanes = residual.of_lanes
 
     @kernel(name=f"score_saturated_{residual.name}")
     def score_saturated(F: F4x2, which: I8x1, rows: F4x2, cells: I4x2, bits: int, out: F8x1) -> None:
-        """Sums over the cells of both images of roots of summed gains of Geman & McClure -> out (k,).
-        rows: the matches. cells: of `saturated_cells`. bits: fractional, that gains and roots are rounded to."""
+        """Sums over the cells of both images of roots of summed gains of Geman & McClure -> out (k,), of SINGLES
+        models at a time. rows: the matches. cells: of `saturated_cells`. bits: fractional, of gains and roots."""
         shift = np.float32(1.5 * 2.0 ** (23 - bits))
-        gains, sums = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty((CELL_ROWS, SINGLES), np.float32)
-        for k in range(len(which)):
-            for row in range(0, len(rows), MATCH):
-                g = geman_mcclure(of_row(F[which[k]], rows, row))
-                store(gains, row // MATCH, rounded(g * load(rows, row + 5), shift))
-            for row in range(CELL_ROWS):
-                store(sums, row, fill(ZERO))
-            gain, of_cell = gains.ravel(), sums.ravel()
+        models, total = np.zeros((9, SINGLES), np.float32), np.empty((1, SINGLES), np.float32)
+        sums = np.empty((2 * GRID * GRID, SINGLES), np.float32)
+        for first in range(0, len(which), SINGLES):
+            count = min(SINGLES, len(which) - first)
+            for k in range(count):
+                for q in range(9):
+                    models[q, k] = F[which[first + k], q]
+            f = (
+                load(models, 0), load(models, 1), load(models, 2), load(models, 3), load(models, 4),
+                load(models, 5), load(models, 6), load(models, 7), load(models, 8),
+            )  # fmt: skip
+            for cell in range(len(sums)):
+                store(sums, cell, fill(ZERO))
             for i in range(cells.shape[1]):
-                of_cell[cells[0, i]] += gain[i]
-                of_cell[cells[1, i]] += gain[i]
-            total = fill(ZERO)
-            for row in range(CELL_ROWS):
-                total += rounded(sqrt(load(sums, row)), shift)
-            out[k] = added(total)
+                row, lane, a, b = i // SINGLES * MATCH, i % SINGLES, cells[0, i], cells[1, i]
+                r2 = of_lanes(f, rows[row, lane], rows[row + 1, lane], rows[row + 2, lane], rows[row + 3, lane])
+                g = rounded(geman_mcclure(r2 * rows[row + 4, lane]) * rows[row + 5, lane], shift)
+                store(sums, a, load(sums, a) + g)
+                store(sums, b, load(sums, b) + g)
+            of_models = fill(ZERO)
+            for cell in range(len(sums)):
+                of_models += rounded(sqrt(load(sums, cell)), shift)
+            store(total, 0, of_models)
+            for k in range(count):
+                out[first + k] = total[0, k]
 
     return score_saturated
 
@@ -353,7 +381,7 @@ def _rows(pair: Pair) -> Array:
 @functools.cache
 def score_median_of(residual: Residual) -> Kernel[..., None]:
     """The kernel of medians for a residual."""
-    of_row = residual.of_row
+    of_row = row_of(residual)
 
     @kernel(name=f"score_median_{residual.name}")
     def score_median(F: F4x2, which: I8x1, rows: F4x2, count: int, out: F8x1) -> None:

@@ -231,12 +231,12 @@ TINY32, TINY_OF_KERNEL = np.finfo(np.float32).tiny, float(np.finfo(np.float64).t
 
 class Residual(NamedTuple):
     """Three inner functions of one residual. name: unique, part of the names of the kernels that are made of it.
-    of_row(f, rows, row): squared residuals of SINGLES matches, float32, times their scale. of_match(f, x0, y0, x1, y1):
+    of_lanes(f, x0, y0, x1, y1): squared residuals of SINGLES matches, or models, float32. of_match(f, x0, y0, x1, y1):
     the square of one, in the type of its arguments. within(f, x0, y0, x1, y1, limit): whether that is within a limit.
     """
 
     name: str
-    of_row: Inner[..., Any]
+    of_lanes: Inner[..., Any]
     of_match: Inner[..., Any]
     within: Inner[..., Any]
 
@@ -251,9 +251,9 @@ def sampson_parts(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, An
 
 
 @inner
-def _sampson_of_row(f: Array, rows: Array, row: int) -> Any:
-    e, slope = sampson_parts(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
-    return e * e / where(slope > TINY32, slope, TINY32) * load(rows, row + 4)
+def _sampson_of_lanes(f: Any, x0: Any, y0: Any, x1: Any, y1: Any) -> Any:
+    e, slope = sampson_parts(f, x0, y0, x1, y1)
+    return e * e / where(slope > TINY32, slope, TINY32)
 
 
 @inner
@@ -268,7 +268,7 @@ def _sampson_within(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, limit: Any) ->
     return e * e <= limit * slope
 
 
-SAMPSON = Residual("sampson", _sampson_of_row, _sampson_of_match, _sampson_within)
+SAMPSON = Residual("sampson", _sampson_of_lanes, _sampson_of_match, _sampson_within)
 """The Sampson distance of a fundamental matrix (Hartley & Zisserman 2004, 11.4.3)."""
 
 
@@ -283,9 +283,9 @@ def _homography(h: Array, x: Any, y: Any, u: Any, v: Any) -> tuple[Any, Any, Any
 
 
 @inner
-def _homography_of_row(h: Array, rows: Array, row: int) -> Any:
-    w, r2, by = _homography(h, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
-    return where(w > ZERO, r2 / where(by > TINY32, by, TINY32) * load(rows, row + 4), INFINITE)
+def _homography_of_lanes(h: Any, x: Any, y: Any, u: Any, v: Any) -> Any:
+    w, r2, by = _homography(h, x, y, u, v)
+    return where(w > ZERO, r2 / where(by > TINY32, by, TINY32), INFINITE)
 
 
 @inner
@@ -299,5 +299,5 @@ def _homography_within(h: Array, x: Any, y: Any, u: Any, v: Any, limit: Any) -> 
     return _homography_of_match(h, x, y, u, v) <= limit
 
 
-HOMOGRAPHY = Residual("homography", _homography_of_row, _homography_of_match, _homography_within)
+HOMOGRAPHY = Residual("homography", _homography_of_lanes, _homography_of_match, _homography_within)
 """The Sampson distance of a homography (4.2.6); infinite behind its horizon (`homography_objective_kernels`)."""

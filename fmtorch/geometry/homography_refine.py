@@ -262,16 +262,10 @@ _minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine_homography(
-    H: Float[Tensor, "*models 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    weight: Float[Tensor, "*batch n"] | None = None,
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    *,
-    loss: str = "truncated",
-    scale: float | Tensor = 1.0,
-    iterations: int = 10,
-) -> Float[Tensor, "*models 3 3"]:
+    H: Float[Tensor, "*models 3 3"], x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"],
+    weight: Float[Tensor, "*batch n"] | None = None, mask: Bool[Tensor, "*batch n"] | None = None,
+    *, loss: str = "truncated", scale: float | Tensor = 1.0, iterations: int = 10,
+) -> Float[Tensor, "*models 3 3"]:  # fmt: skip
     """The homography of least robust Sampson error near H: ``sum_i w_i rho(r_i^2)``.
 
     Hartley & Zisserman (2004), 4.5 and 4.2.6. Differentiable in points and weights by the implicit function theorem

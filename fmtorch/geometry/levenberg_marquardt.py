@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
 from fmtorch.geometry.arithmetic import sqrt as exact_sqrt
-from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, Inner, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
 QUANTILE = 3.64
@@ -163,24 +163,66 @@ class Weighted(NamedTuple):
         return Weighted(points, weight, s2, LOSS_CODES[loss], LOSS_TABLE if loss == "magsac" else NO_TABLE)
 
 
+BLOCK = 16  # times LANES matches, whose derivatives stand in the nearest cache
+
+
+class Rows(NamedTuple):
+    """`in_rows` of matches, their loss, and room for sums (size size, LANES), derivatives and these weighted."""
+
+    matches: F8x2
+    loss: int
+    table: F8x2
+    sums: F8x2
+    J: F8x2
+    scaled: F8x2
+    work: F8x2
+
+
+@inner
+def rows_of(weighted: Weighted, size: int) -> Rows:
+    """The matches for a sum over derivatives and residual, together of this size, an even number."""
+    matches = in_rows(weighted.points, weighted.weight, weighted.s2)
+    sums, J, scaled = matrix(size * size, LANES), matrix(size * BLOCK, LANES), matrix(size * BLOCK, LANES)
+    return Rows(matches, weighted.loss, weighted.table, sums, J, scaled, matrix(3, LANES))
+
+
+def summation(linearise: Inner[..., Any], size: int) -> Inner[..., Any]:
+    """summed(model, rows, derivatives, products): the robust cost of a model, and if asked the weighted products of
+    derivatives and residual (size, size). linearise(model, matches, row, J, at): those of LANES matches -> J from row
+    `at` on; inverse squared slopes and squared distances."""
+
+    @inner
+    def summed(model: Any, rows: Rows, derivatives: bool, products: Array) -> Any:
+        matches, loss, table, sums, J, scaled, work = rows
+        costs = fill(0.0)
+        for q in range(len(sums) if derivatives else 0):
+            store(sums, q, costs)
+        for first in range(0, len(matches), MATCH * BLOCK):
+            count = min((len(matches) - first) // MATCH, BLOCK)
+            for b in range(count):
+                row, at = first + b * MATCH, b * size
+                inverse, r2 = linearise(model, matches, row, J, at)
+                share, slope = robust(r2, load(matches, row + 5), loss, table, work)
+                costs += share * load(matches, row + 4)
+                if derivatives:
+                    factor = inverse * (load(matches, row + 4) * slope)
+                    for r in range(size):
+                        store(scaled, at + r, load(J, at + r) * factor)
+            if derivatives:
+                add_products(J, scaled, count, size, sums)
+        if derivatives:
+            assemble(sums, products)
+        return added(costs)
+
+    return summed
+
+
 @kernel
 def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
     """Robust weighted cost (k,) of models (k, 9) by Sampson distances; with derivatives also products (k, 10, 10)."""
-    matches, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
-    sums, J, scaled, work = matrix(55, LANES), matrix(10, LANES), matrix(10, LANES), matrix(3, LANES)
+    rows = rows_of(weighted, 10)
     for k in range(len(F)):
-        costs = fill(0.0)
-        for q in range(55 if derivatives else 0):
-            store(sums, q, costs)
-        for row in range(0, len(matches), MATCH):
-            inverse, r2 = linearise_kernel(F[k], matches, row, J)
-            share, slope = robust(r2, load(matches, row + 5), loss, table, work)
-            costs += share * load(matches, row + 4)
-            if derivatives:
-                add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
-        cost[k] = added(costs)
-        if derivatives:
-            assemble(sums, products[k])
+        cost[k] = _summed(F[k], rows, derivatives, products[k])
 
 
 @inner
@@ -200,8 +242,8 @@ def in_rows(points: Array, weight: Array, s2: Array) -> Array:
 
 
 @inner
-def linearise_kernel(f: Array, matches: Array, row: int, J: Array) -> tuple[Any, Any]:
-    """Jacobian and residual of LANES matches -> J (10, LANES); inverse squared slopes, squared Sampson distances."""
+def linearise_kernel(f: Array, matches: Array, row: int, J: Array, at: int) -> tuple[Any, Any]:
+    """Jacobian and residual of LANES matches -> ten rows of J; inverse squared slopes, squared Sampson distances."""
     x0, y0, x1, y1 = load(matches, row), load(matches, row + 1), load(matches, row + 2), load(matches, row + 3)
     a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
     a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
@@ -210,9 +252,12 @@ def linearise_kernel(f: Array, matches: Array, row: int, J: Array) -> tuple[Any,
     inverse = 1.0 / where(slope > TINY, slope, TINY)
     c = e * inverse
     u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
-    store(J, 0, (u * x0 + x1 * p, u * y0 + x1 * q, u, v * x0 + y1 * p, v * y0 + y1 * q, v))
-    store(J, 6, (x0 + p, y0 + q, fill(1.0), e))
+    store(J, at, (u * x0 + x1 * p, u * y0 + x1 * q, u, v * x0 + y1 * p, v * y0 + y1 * q, v))
+    store(J, at + 6, (x0 + p, y0 + q, fill(1.0), e))
     return inverse, e * c
+
+
+_summed = summation(linearise_kernel, 10)
 
 
 @inner
@@ -254,27 +299,28 @@ def _tabulated(table: Array, work: Array) -> None:
 
 
 @inner
-def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
-    """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
-    for r in range(len(J)):
-        store(weighted, r, load(J, r) * factor)
-    q = 0
-    for r in range(len(J)):
-        of_row = load(J, r)
-        for c in range(r + 1):
-            store(sums, q, load(sums, q) + of_row * load(weighted, c))
-            q += 1
+def add_products(J: Array, weighted: Array, count: int, size: int, sums: Array) -> None:
+    """Adds the products of Jacobian and residual, which have a size, an even number of rows, for each LANES matches.
+    sums: (size size, LANES), of which the upper triangle is not used; two by two, so that four are in registers."""
+    for r in range(0, size, 2):
+        for c in range(0, r + 1, 2):
+            q = r * size + c
+            s00, s01, s10, s11 = load(sums, q), load(sums, q + 1), load(sums, q + size), load(sums, q + size + 1)
+            for row in range(0, count * size, size):
+                a, b = load(J, row + r), load(J, row + r + 1)
+                d, e = load(weighted, row + c), load(weighted, row + c + 1)
+                s00, s01, s10, s11 = s00 + a * d, s01 + a * e, s10 + b * d, s11 + b * e
+            store(sums, q, (s00, s01))
+            store(sums, q + size, (s10, s11))
 
 
 @inner
 def assemble(sums: Array, products: Array) -> None:
     """The sums of `add_products` -> products, both triangles."""
-    q = 0
     for r in range(len(products)):
         for c in range(r + 1):
-            total = added(load(sums, q))
+            total = added(load(sums, r * len(products) + c))
             products[r, c], products[c, r] = total, total
-            q += 1
 
 
 SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half

@@ -267,19 +267,12 @@ class Evidence(NamedTuple):
 
 @torch.no_grad()
 def pair_evidence(
-    F: Float[Tensor, "b 3 3"],
-    H: Float[Tensor, "b 3 3"],
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    mask: Bool[Tensor, "b n"] | None = None,
-    prior: Float[Tensor, "b n"] | None = None,
-    noise: Float[Tensor, "b n"] | None = None,
-    size0: Real[Tensor, "b 2"] | None = None,
-    size1: Real[Tensor, "b 2"] | None = None,
-    K0: Float[Tensor, "b 3 3"] | None = None,
-    K1: Float[Tensor, "b 3 3"] | None = None,
-    focal_precision: Float[Tensor, "b 2 2"] | None = None,
-) -> Evidence:
+    F: Float[Tensor, "b 3 3"], H: Float[Tensor, "b 3 3"], x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"],
+    mask: Bool[Tensor, "b n"] | None = None, prior: Float[Tensor, "b n"] | None = None,
+    noise: Float[Tensor, "b n"] | None = None, size0: Real[Tensor, "b 2"] | None = None,
+    size1: Real[Tensor, "b 2"] | None = None, K0: Float[Tensor, "b 3 3"] | None = None,
+    K1: Float[Tensor, "b 3 3"] | None = None, focal_precision: Float[Tensor, "b 2 2"] | None = None,
+) -> Evidence:  # fmt: skip
     """How well the kinds of pairs explain the matches of B pairs; `classified` decides.
 
     Args:

@@ -69,16 +69,10 @@ _minimise = minimiser(_evaluate, _step, _take)
 
 
 def refine(
-    F: Float[Tensor, "*models 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    weight: Float[Tensor, "*batch n"] | None = None,
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    *,
-    loss: str = "truncated",
-    scale: float | Tensor = 1.0,
-    iterations: int = 10,
-) -> Float[Tensor, "*models 3 3"]:
+    F: Float[Tensor, "*models 3 3"], x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"],
+    weight: Float[Tensor, "*batch n"] | None = None, mask: Bool[Tensor, "*batch n"] | None = None,
+    *, loss: str = "truncated", scale: float | Tensor = 1.0, iterations: int = 10,
+) -> Float[Tensor, "*models 3 3"]:  # fmt: skip
     """The fundamental matrix of least robust Sampson error near F: ``sum_i w_i rho(r_i^2)``.
 
     Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3. Differentiable in points and weights, not in F: by the
@@ -114,15 +108,10 @@ def refine(
 
 
 def attached_step(
-    F: Float[Tensor, "*models 3 3"],
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    weight: Float[Tensor, "*batch n"] | None = None,
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    *,
-    loss: str = "truncated",
-    scale: float | Tensor = 1.0,
-) -> Float[Tensor, "*models 3 3"]:
+    F: Float[Tensor, "*models 3 3"], x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"],
+    weight: Float[Tensor, "*batch n"] | None = None, mask: Bool[Tensor, "*batch n"] | None = None,
+    *, loss: str = "truncated", scale: float | Tensor = 1.0,
+) -> Float[Tensor, "*models 3 3"]:  # fmt: skip
     """One Gauss-Newton step from a refined F, whose gradients are those of the optimum.
 
     The gradient of the cost is attached to the graph of points and weights, the normal matrix is not. This is the
@@ -245,16 +234,10 @@ Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 
 
 def irls(
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    F0: Float[Tensor, "*models 3 3"],
-    weight: Float[Tensor, "*batch n"] | None = None,
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    *,
-    loss: str = "cauchy",
-    scale: float | Tensor = 1.0,
-    iterations: int = 5,
-) -> Float[Tensor, "*models 3 3"]:
+    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], F0: Float[Tensor, "*models 3 3"],
+    weight: Float[Tensor, "*batch n"] | None = None, mask: Bool[Tensor, "*batch n"] | None = None,
+    *, loss: str = "cauchy", scale: float | Tensor = 1.0, iterations: int = 5,
+) -> Float[Tensor, "*models 3 3"]:  # fmt: skip
     """Fundamental matrices near F0 by the normalised 8-point algorithm with Sampson weights, repeated.
 
     Each iteration weighs the squared algebraic error ``e^2`` of a match by ``w rho'(r^2) / g^2``, where ``r = e / g``
@@ -421,7 +404,7 @@ def reweighted_kernel(F: F8x2, weighted: Weighted) -> None:
     weights, fitted = matrix(len(matches) // MATCH, LANES), vector(9)
     for k in range(len(F)):
         for row in range(0, len(matches), MATCH):
-            inverse, r2 = levenberg_marquardt.linearise_kernel(F[k], matches, row, J)
+            inverse, r2 = levenberg_marquardt.linearise_kernel(F[k], matches, row, J, 0)
             _, slope = levenberg_marquardt.robust(r2, load(matches, row + 5), weighted.loss, weighted.table, work)
             store(weights, row // MATCH, inverse * (load(matches, row + 4) * slope))
         if weighted_eight_point(weighted.points, weights.ravel()[: len(weighted.weight)], fitted):

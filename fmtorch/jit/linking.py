@@ -110,7 +110,8 @@ def inner_compiler() -> Any:
     """The compiler of inner functions, for numba's `pipeline_class`: neither optimised nor machine code on their own.
     numba compiles each function that another calls as if it were called from Python, too. A kernel is optimised as a
     whole after all of its inner functions have been linked in, so that this would be half of compiling's time for
-    nothing. The names used here are numba's own."""
+    nothing. They become part of what calls them in any case, however long: a call in the middle of a loop keeps it from
+    being vectorised, and values from staying in registers. The names used here are numba's own."""
     from numba.core import codegen, compiler
 
     class Codegen:
@@ -131,6 +132,12 @@ def inner_compiler() -> Any:
         @property
         def codegen(self) -> Any:
             return Codegen(self._codegen)
+
+        def add_llvm_module(self, module: Any) -> None:
+            for function in module.functions:
+                if not function.is_declaration:
+                    function.add_function_attribute("alwaysinline")
+            super().add_llvm_module(module)
 
         def _optimize_final_module(self) -> None:
             pass

@@ -170,16 +170,10 @@ MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
 
 
 def match_noise(
-    lafs0: Float[Tensor, "b n 2 3"],
-    lafs1: Float[Tensor, "b n 2 3"],
-    ratio: Float[Tensor, "b n"] | None = None,
-    prior: Float[Tensor, "b n"] | None = None,
-    mask: Bool[Tensor, "b n"] | None = None,
-    *,
-    usual: float,
-    radius: float,
-    slope: float,
-) -> Float[Tensor, "b n"]:
+    lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"], ratio: Float[Tensor, "b n"] | None = None,
+    prior: Float[Tensor, "b n"] | None = None, mask: Bool[Tensor, "b n"] | None = None,
+    *, usual: float, radius: float, slope: float,
+) -> Float[Tensor, "b n"]:  # fmt: skip
     """Standard deviation of each match's distance to its epipolar line, in units of a usual match's.
     ``(1 + s / radius) (1 + slope ratio)^2 P^(-1/4) / usual`` with s the larger of the two frames' scales in pixels: a
     keypoint is located to a share of its size, and matches that are hard to tell apart, or that their neighbours

@@ -270,17 +270,12 @@ class Coherence(NamedTuple):
 
 @torch.no_grad()
 def coherence(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    *,
-    mask: Bool[Tensor, "b n"] | None = None,
-    ratio: Float[Tensor, "b n"] | None = None,
-    lafs0: Float[Tensor, "b n 2 3"] | None = None,
-    lafs1: Float[Tensor, "b n 2 3"] | None = None,
-    least_likelihood: float = MIN_LIKELIHOOD,
-    likelihood: LikelihoodField | None = None,
+    x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"],
+    *, mask: Bool[Tensor, "b n"] | None = None, ratio: Float[Tensor, "b n"] | None = None,
+    lafs0: Float[Tensor, "b n 2 3"] | None = None, lafs1: Float[Tensor, "b n 2 3"] | None = None,
+    least_likelihood: float = MIN_LIKELIHOOD, likelihood: LikelihoodField | None = None,
     motion: SmoothMotion | None = None,
-) -> Coherence:
+) -> Coherence:  # fmt: skip
     """The likelihood of each match and its distance from the smooth motion of those above `least_likelihood`.
     Two robust regressions on radial basis functions, as in CODE; our form differs from the authors' in that the centres
     are chosen where distinctive matches crowd, and that each predicts its neighbours' displacement by its frame. Points

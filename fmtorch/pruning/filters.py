@@ -268,17 +268,10 @@ GRIDS = (20, 10, 14, 28, 40)
 
 
 def gms(
-    x0: Points,
-    x1: Points,
-    *,
-    size0: Int[Tensor, "b 2"],
-    size1: Int[Tensor, "b 2"],
-    mask: Bool[Tensor, "b n"] | None = None,
-    with_rotation: bool = False,
-    with_scale: bool = False,
-    threshold_factor: float = 6.0,
-    border: Border = "opencv",
-) -> Bool[Tensor, "b n"]:
+    x0: Points, x1: Points,
+    *, size0: Int[Tensor, "b 2"], size1: Int[Tensor, "b 2"], mask: Bool[Tensor, "b n"] | None = None,
+    with_rotation: bool = False, with_scale: bool = False, threshold_factor: float = 6.0, border: Border = "opencv",
+) -> Bool[Tensor, "b n"]:  # fmt: skip
     """True for matches whose neighbours move with them, as counted on coarse grids.
 
     Each of four shifted 20 x 20 grids in image 0 assigns every cell the cell of image 1 that most of its matches go
@@ -296,17 +289,10 @@ def gms(
 
 
 def gms_support(
-    x0: Points,
-    x1: Points,
-    *,
-    size0: Int[Tensor, "b 2"],
-    size1: Int[Tensor, "b 2"],
-    mask: Bool[Tensor, "b n"] | None = None,
-    with_rotation: bool = False,
-    with_scale: bool = False,
-    threshold_factor: float = 6.0,
-    border: Border = "opencv",
-) -> Float[Tensor, "b n"]:
+    x0: Points, x1: Points,
+    *, size0: Int[Tensor, "b 2"], size1: Int[Tensor, "b 2"], mask: Bool[Tensor, "b n"] | None = None,
+    with_rotation: bool = False, with_scale: bool = False, threshold_factor: float = 6.0, border: Border = "opencv",
+) -> Float[Tensor, "b n"]:  # fmt: skip
     """How many neighbours move with each match, against how many would suffice by the square root; in [0, 1).
     In each of the four grids, ``z = (score - 1) / sqrt(mean matches of the nine cells, at least 1)``, where the score
     counts the matches, itself included, of the nine cells around that go where the match's own cells say: the paper's

@@ -272,14 +272,10 @@ def _differs(points0: Array, points1: Array, i: int, j: int, tau: float) -> Any:
 
 
 def lpm(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    *,
-    mask: Bool[Tensor, "b n"] | None = None,
-    thresholds: Sequence[float] = (0.8, 0.5),
-    neighbors: Sequence[int] = (6, 6),
-    taus: Sequence[float] = (0.2, 0.2),
-) -> Bool[Tensor, "b n"]:
+    x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"],
+    *, mask: Bool[Tensor, "b n"] | None = None, thresholds: Sequence[float] = (0.8, 0.5),
+    neighbors: Sequence[int] = (6, 6), taus: Sequence[float] = (0.2, 0.2),
+) -> Bool[Tensor, "b n"]:  # fmt: skip
     """True for matches whose neighbourhoods in the two images hold the same matches, moving alike.
     The cost of a match is the mean over three neighbourhood sizes (K + 2, K, K - 2) of the share of its neighbours that
     are near in one image only or whose motion differs, ``cos(angle) * ratio of squared lengths < tau``. Two passes,
@@ -291,14 +287,10 @@ def lpm(
 
 
 def lpm_cost(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    *,
-    mask: Bool[Tensor, "b n"] | None = None,
-    thresholds: Sequence[float] = (0.8, 0.5),
-    neighbors: Sequence[int] = (6, 6),
-    taus: Sequence[float] = (0.2, 0.2),
-) -> Float[Tensor, "b n"]:
+    x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"],
+    *, mask: Bool[Tensor, "b n"] | None = None, thresholds: Sequence[float] = (0.8, 0.5),
+    neighbors: Sequence[int] = (6, 6), taus: Sequence[float] = (0.2, 0.2),
+) -> Float[Tensor, "b n"]:  # fmt: skip
     """The mean of the costs of the passes of `lpm`, in [0, 1]; 1 for masked matches and non-finite points.
     The second pass sees what the first kept: together they tell right from wrong best. Arguments as `lpm`."""
     return _kept_and_cost(x0, x1, mask, _passes(thresholds, neighbors, taus))[:, 1].to(x0.dtype)

@@ -92,19 +92,12 @@ def classification_loss(logit: Float[Tensor, "*stages b n"], label: Int8[Tensor,
 
 
 def geometric_loss(
-    F_est: Float[Tensor, "*stages b 3 3"],
-    F_true: Float[Tensor, "b 3 3"],
-    size0: Real[Tensor, "b 2"],
+    F_est: Float[Tensor, "*stages b 3 3"], F_true: Float[Tensor, "b 3 3"], size0: Real[Tensor, "b 2"],
     size1: Real[Tensor, "b 2"],
-    *,
-    K0: Float[Tensor, "b 3 3"] | None = None,
-    K1: Float[Tensor, "b 3 3"] | None = None,
-    valid: Bool[Tensor, "*stages b"] | None = None,
-    limit: float | None = None,
-    points: int = 256,
-    seed: int = 0,
+    *, K0: Float[Tensor, "b 3 3"] | None = None, K1: Float[Tensor, "b 3 3"] | None = None,
+    valid: Bool[Tensor, "*stages b"] | None = None, limit: float | None = None, points: int = 256, seed: int = 0,
     key: Int[Tensor, " b"] | None = None,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """Squared symmetric epipolar distance of virtual points of the true geometry, clamped, in normalised coordinates.
 
     The sum of the two squared point-to-line distances (Hartley & Zisserman, eq. 11.10) of `virtual_points`, at most
@@ -146,17 +139,11 @@ def geometric_loss(
 
 
 def nsgd_loss(
-    F_est: Float[Tensor, "*stages b 3 3"],
-    F_true: Float[Tensor, "b 3 3"],
-    size0: Real[Tensor, "b 2"],
+    F_est: Float[Tensor, "*stages b 3 3"], F_true: Float[Tensor, "b 3 3"], size0: Real[Tensor, "b 2"],
     size1: Real[Tensor, "b 2"],
-    *,
-    valid: Bool[Tensor, "*stages b"] | None = None,
-    limit: float | None = None,
-    samples: int = 100,
-    seed: int = 0,
+    *, valid: Bool[Tensor, "*stages b"] | None = None, limit: float | None = None, samples: int = 100, seed: int = 0,
     key: Int[Tensor, " b"] | None = None,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """The benchmark's own figure as a loss: `fmtorch.metrics.nsgd` without its cap, the mean over pairs and stages.
 
     A pair without an accepted draw (lines miss the image) counts 1 without gradient: train with another loss, too.
