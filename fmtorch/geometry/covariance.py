@@ -243,21 +243,13 @@ class TwoViewCovariance(NamedTuple):
 
 
 def two_view_covariance(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    R: Float[Tensor, "b 3 3"],
-    t: Float[Tensor, "b 3"],
-    focal: Float[Tensor, "b 2"],
-    principal0: Float[Tensor, "b 2"],
-    principal1: Float[Tensor, "b 2"],
-    truncation: Float[Tensor, " b"],
-    weight: Float[Tensor, "b n"] | None = None,
-    noise: Float[Tensor, "b n"] | None = None,
-    mask: Bool[Tensor, "b n"] | None = None,
-    focal_precision: Float[Tensor, "b 2 2"] | None = None,
-    shared_focal: Bool[Tensor, " b"] | None = None,
+    x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"], R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"],
+    focal: Float[Tensor, "b 2"], principal0: Float[Tensor, "b 2"], principal1: Float[Tensor, "b 2"],
+    truncation: Float[Tensor, " b"], weight: Float[Tensor, "b n"] | None = None,
+    noise: Float[Tensor, "b n"] | None = None, mask: Bool[Tensor, "b n"] | None = None,
+    focal_precision: Float[Tensor, "b 2 2"] | None = None, shared_focal: Bool[Tensor, " b"] | None = None,
     lens: LensesInPixels | None = None,
-) -> TwoViewCovariance:
+) -> TwoViewCovariance:  # fmt: skip
     """The covariance of pose, focal lengths, lenses and F at the optimum of a robust fit, in closed form.
 
     Nothing is NaN: what the matches leave open has a deviation of up to `DIFFUSE`. A local covariance knows nothing of

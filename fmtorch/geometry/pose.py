@@ -47,15 +47,9 @@ def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses
 
 
 def pose_from_fundamental(
-    F: Matrices,
-    K0: Matrices,
-    K1: Matrices,
-    x0: Points,
-    x1: Points,
-    mask: Mask | None = None,
-    weight: PerMatch | None = None,
-    behind: Bool[Tensor, "*batch n 2"] | None = None,
-) -> Pose:
+    F: Matrices, K0: Matrices, K1: Matrices, x0: Points, x1: Points, mask: Mask | None = None,
+    weight: PerMatch | None = None, behind: Bool[Tensor, "*batch n 2"] | None = None,
+) -> Pose:  # fmt: skip
     """Rotation and direction of translation from E = K1^T F K0, of the four decompositions the one with most points
     of positive depth in both cameras.
 

@@ -199,15 +199,11 @@ def most_significant(chance: F8x1, factorial: F8x1, sample: int, log_models: flo
 
 @torch.no_grad()
 def significance(
-    F: Float[Tensor, "b 3 3"],
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    mask: Bool[Tensor, "b n"] | None = None,
-    size0: Real[Tensor, "b 2"] | None = None,
+    F: Float[Tensor, "b 3 3"], x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"],
+    mask: Bool[Tensor, "b n"] | None = None, size0: Real[Tensor, "b 2"] | None = None,
     size1: Real[Tensor, "b 2"] | None = None,
-    *,
-    model: str = "fundamental",
-) -> Float[Tensor, " b"]:
+    *, model: str = "fundamental",
+) -> Float[Tensor, " b"]:  # fmt: skip
     """-log10 of the number of false alarms of a model: above 0, so much support is not to be expected by chance.
 
     With the n matches in the order of their distances from the epipolar lines (the larger one of the two images, each

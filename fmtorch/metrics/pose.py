@@ -74,17 +74,10 @@ def pose_error(
 
 @checked
 def fundamental_pose_error(
-    F: Matrices,
-    K0: Matrices,
-    K1: Matrices,
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    R_gt: Matrices,
-    t_gt: Float[Tensor, "*batch 3"],
-    mask: Bool[Tensor, "*batch n"] | None = None,
-    *,
-    up_to_sign: bool = True,
-) -> PoseError:
+    F: Matrices, K0: Matrices, K1: Matrices, x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"],
+    R_gt: Matrices, t_gt: Float[Tensor, "*batch 3"], mask: Bool[Tensor, "*batch n"] | None = None,
+    *, up_to_sign: bool = True,
+) -> PoseError:  # fmt: skip
     """`pose_error` of the pose that F has with known calibrations: E = K1^T F K0, decomposed, cheirality checked.
 
     Args:

@@ -165,14 +165,9 @@ def nsgd_loss(
 
 
 def virtual_points(
-    F: Float[Tensor, "b 3 3"],
-    size0: Real[Tensor, "b 2"],
-    size1: Real[Tensor, "b 2"],
-    *,
-    count: int = 256,
-    seed: int = 0,
-    key: Int[Tensor, " b"] | None = None,
-) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
+    F: Float[Tensor, "b 3 3"], size0: Real[Tensor, "b 2"], size1: Real[Tensor, "b 2"],
+    *, count: int = 256, seed: int = 0, key: Int[Tensor, " b"] | None = None,
+) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:  # fmt: skip
     """Points of image 0 and, on their epipolar lines, points of image 1, each inside its image; without gradients.
 
     A point is drawn uniformly in image 0, its partner uniformly on the part of its line inside image 1, as NSGD draws

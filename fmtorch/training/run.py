@@ -11,7 +11,9 @@ import os
 import platform
 import re
 import shlex
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections import Counter
@@ -169,31 +171,53 @@ def train(
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
             once: Any = [0]  # one item, for the one step of validation, which has its own pairs
             validation: DataLoader[Any] = DataLoader(once, batch_size=None)
+            handler = signal.getsignal(signal.SIGINT)
+            if lightning_trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, kept.interrupt)
             try:
                 lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
             except SystemExit:  # which Lightning makes of Ctrl-C
                 reached = latest_checkpoint(folder)[1]
                 raise KeyboardInterrupt(f"step {reached} of {total} is kept in {folder}") from None
+            finally:
+                if threading.current_thread() is threading.main_thread():
+                    signal.signal(signal.SIGINT, handler)
             step = lightning_trainer.global_step
     return step, module.seconds
 
 
 class _ResumableCheckpoint(ModelCheckpoint):
-    """Checkpoints at every so many steps: at a step of validation when that is done, its best figure included.
-    Lightning saves before it validates, and a training that goes on from there would lack that validation."""
+    """Checkpoints at every so many steps, and at the end of one in which Ctrl-C comes: at a step of validation when
+    that is done, its best figure included. Lightning saves before it validates, and a training that goes on from there
+    would lack that validation."""
 
     def __init__(self, *args: Any, validated_every: int, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.validated_every = validated_every
+        self.validated_every, self.interrupted = validated_every, False
+
+    def interrupt(self, *_: Any) -> None:
+        """Handle the first Ctrl-C; a second one ends at once."""
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.interrupted = True
+
+    def _save_if_due(self, trainer: lightning.Trainer) -> None:
+        if self.interrupted and trainer.global_step % self._every_n_train_steps:
+            self._save_topk_checkpoint(trainer, self._monitor_candidates(trainer))
+        else:
+            super().on_train_batch_end(trainer, trainer.lightning_module, {}, None, 0)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         if trainer.global_step % self.validated_every:
-            super().on_train_batch_end(trainer, trainer.lightning_module, {}, None, 0)
+            self._save_if_due(trainer)
+            if self.interrupted:
+                raise KeyboardInterrupt
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Save after a validation; that of the best weights comes before in the list of callbacks."""
-        super().on_train_batch_end(trainer, pl_module, {}, None, 0)
+        self._save_if_due(trainer)
         super().on_validation_end(trainer, pl_module)  # what the last batch puts off
+        if self.interrupted:
+            raise KeyboardInterrupt
 
 
 class _TrainingBar(Callback):

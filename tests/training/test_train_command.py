@@ -230,16 +230,18 @@ t.trained_by_hand(Path({str(tmp_path / "parts")!r}))
         assert latest_checkpoint(tmp_path / "parts")[1] == STEPS
 
 
-def test_interrupted_it_says_what_is_kept(tmp_path: Path) -> None:
-    stopped = module()
-
-    def stop(*_: object) -> None:
-        if stopped.global_step == 7:
-            raise KeyboardInterrupt
-
-    stopped.on_train_batch_start = stop
-    with pytest.raises(KeyboardInterrupt, match=rf"step 6 of {STEPS} is kept in {tmp_path}"):
+@pytest.mark.parametrize("step", [5, 7])
+def test_interrupted_it_ends_the_step_and_says_what_is_kept(tmp_path: Path, step: int) -> None:
+    """Validation is at 5 and 10: Ctrl-C after its step is met when it has its figure. A second one ends at once."""
+    stopped, calls = module(), itertools.count(1)
+    stopped.on_before_zero_grad = lambda _: next(calls) == step and signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=rf"step {step} of {STEPS} is kept in {tmp_path}"):
         train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="hard/AUC@0.05")
+    assert {path.name for path in (tmp_path / loop.CHECKPOINTS).iterdir()} == {f"step={step}.ckpt", loop.BEST}
+    stopped.on_before_zero_grad = lambda _: [signal.raise_signal(signal.SIGINT) for _ in range(2)]
+    with pytest.raises(KeyboardInterrupt, match=rf"step {step} of"):
+        train(stopped, tmp_path, every=5, checkpoint_every=3, monitor="hard/AUC@0.05")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_network_that_cannot_be_trained_is_named(tmp_path: Path) -> None:
