@@ -199,7 +199,8 @@ class Ransac:
         if choice is not None:
             own = self.family.fit_scale._replace(scale_sigmas=choice.own_noise or 0.0)
             first: Any = part("score", choice.score, threshold=choice.scale)
-            scaled = choice.own_noise and takes("score", choice.score, "threshold") and first.threshold == choice.scale
+            own_scale = isinstance(choice.score, Mapping) and "threshold" in choice.score
+            scaled = choice.own_noise and takes("score", choice.score, "threshold") and not own_scale
             self.select = refinement.BestScore(first, functools.partial(_at_noise, first, own) if scaled else None)
         self.focal = self._focal_search(stage(focal, Focal), choice)
 

@@ -242,14 +242,14 @@ class KernelFile:
         self.path, self.missing = path, missing
         self.calls: list[Any] = []
         self.compiled = False
-        self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
+        self._lock: Any = None  # held while this process compiles, or until it ends, however that is
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
         if (loaded := self._loaded(signature, target_context)) is not None:
             return loaded
         if self._acquire() and (loaded := self._loaded(signature, target_context)) is not None:
-            self._release()
+            self.release()
             return loaded  # another process has just compiled it
         kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
         self.missing(kept)
@@ -290,14 +290,14 @@ class KernelFile:
         except OSError as error:
             warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
         finally:
-            self._release()
+            self.release()
 
     def _acquire(self) -> bool:
         """Wait for a process that compiles the same; False where no file can be locked."""
         import filelock  # only now: loading a kernel needs none
 
-        if self.path is None or self._lock is not None:  # held since a compilation that failed
-            return self._lock is not None
+        if self.path is None:
+            return False
         lock = filelock.FileLock(self.path.with_name(f"{self.path.name}.lock"), thread_local=False)
         try:
             lock.acquire()
@@ -306,7 +306,8 @@ class KernelFile:
         self._lock = lock
         return True
 
-    def _release(self) -> None:
+    def release(self) -> None:
+        """Let others compile the same."""
         if self._lock is not None:
             self._lock.release()
             with contextlib.suppress(OSError):

@@ -278,6 +278,7 @@ def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], lis
     try:
         dispatcher.compile(uncompiled.signature)
     finally:
+        file.release()
         if enabled:
             gc.enable()
     if file.compiled and sys.stderr.isatty():

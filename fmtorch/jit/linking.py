@@ -133,11 +133,11 @@ def inner_compiler() -> Any:
         def codegen(self) -> Any:
             return Codegen(self._codegen)
 
-        def add_llvm_module(self, module: Any) -> None:
+        def add_ir_module(self, module: Any) -> None:
             for function in module.functions:
-                if not function.is_declaration:
-                    function.add_function_attribute("alwaysinline")
-            super().add_llvm_module(module)
+                if not function.is_declaration and "noinline" not in function.attributes:
+                    function.attributes.add("alwaysinline")
+            super().add_ir_module(module)
 
         def _optimize_final_module(self) -> None:
             pass

@@ -199,6 +199,7 @@ class _ResumableCheckpoint(ModelCheckpoint):
         """Handle the first Ctrl-C; a second one ends at once."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self.interrupted = True
+        terminal.console.print("ends after this step, which is kept; Ctrl-C again ends at once", soft_wrap=True)
 
     def _save_if_due(self, trainer: lightning.Trainer) -> None:
         if self.interrupted and trainer.global_step % self._every_n_train_steps:
