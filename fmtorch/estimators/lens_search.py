@@ -115,7 +115,8 @@ def minimise_with_lenses(
         state.evidence[i] = -state.cost[i] - _inverted(state.hessian[i], state.inverse[i]) / 2 + normaliser / 2
         for j in range(2):
             place = LENS + j * (own - 1)
-            state.deviation[i, j] = math.sqrt(abs(state.inverse[i, place, place]))
+            variance = abs(state.inverse[i, place, place])
+            state.deviation[i, j] = math.sqrt(variance) if variance == variance else math.inf
 
 
 @inner

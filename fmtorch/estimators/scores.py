@@ -96,9 +96,7 @@ class SummedGains:
 
     def at(self, threshold: float) -> "SummedGains":
         """The same score at another threshold, px."""
-        other = object.__new__(type(self))
-        other.__dict__ |= vars(self) | {"threshold": threshold}
-        return other
+        return type(self)(threshold, self.prior_weighted)
 
     def gain(self, squared: Array) -> Array:
         """Gains in [0, 1] at squared residuals in thresholds, (models, matches) float32."""

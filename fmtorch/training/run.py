@@ -171,17 +171,16 @@ def train(
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
             once: Any = [0]  # one item, for the one step of validation, which has its own pairs
             validation: DataLoader[Any] = DataLoader(once, batch_size=None)
-            handler = signal.getsignal(signal.SIGINT)
-            if lightning_trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGINT, kept.interrupt)
+            alone = lightning_trainer.world_size == 1 and threading.current_thread() is threading.main_thread()
+            before = signal.signal(signal.SIGINT, kept.interrupt) if alone else None
             try:
                 lightning_trainer.fit(module, own, validation, ckpt_path=path, weights_only=True)
             except SystemExit:  # which Lightning makes of Ctrl-C
                 reached = latest_checkpoint(folder)[1]
                 raise KeyboardInterrupt(f"step {reached} of {total} is kept in {folder}") from None
             finally:
-                if threading.current_thread() is threading.main_thread():
-                    signal.signal(signal.SIGINT, handler)
+                if before is not None:
+                    signal.signal(signal.SIGINT, before)
             step = lightning_trainer.global_step
     return step, module.seconds
 

@@ -300,8 +300,7 @@ def test_local_optimisation_comes_first() -> None:
 
 
 def test_the_best_score_of_the_pool() -> None:
-    pair = pair_of(scene(1, 100))
-    F = np.random.default_rng(0).normal(size=(6, 9))
+    pair, F = pair_of(scene(1, 100)), np.random.default_rng(0).normal(size=(6, 9))
     best = int(np.argmax(scores_of(estimators.Msac(50.0), F, pair)))
     assert best > 0
     np.testing.assert_array_equal(BestScore(estimators.Msac(50.0))(Candidates(F, True, pair), pair).F, F[best])
@@ -311,10 +310,9 @@ def test_the_best_score_of_the_pool() -> None:
 @pytest.mark.parametrize(("noise", "count"), [(0.01, 300), (0.3, 300), (0.6, 300), (9.0, 300), (0.3, 14)])
 def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count: int) -> None:
     """The scale is 1.5 robust deviations of the likely matches within 2 px of the first choice, 0.3 to 2 px, and
-    1.5 px where these are fewer than 15."""
+    1.5 px where these are fewer than 15. A score with a threshold of its own keeps it."""
     pair = pair_of(scene(2, count, outliers=0.1, noise=noise))
-    start = models(pair, 30)[1:]
-    F = estimators.SevenPoint().refine(start, pair, "cauchy", 2.0, Schedule(20, 1e-4, 0.0))
+    F = estimators.SevenPoint().refine(models(pair, 30)[1:], pair, "cauchy", 2.0, Schedule(20, 1e-4, 0.0))
     first = F[int(np.argmax(scores_of(estimators.Msac(0.3), F, pair)))]
     r = np.sqrt(residuals_squared_px(first, pair)) / pair.noises
     r = r[(r <= 2) & (pair.match_weight > 0.3)]
@@ -323,6 +321,8 @@ def test_the_second_choice_is_made_at_the_noise_of_the_pair(noise: float, count:
     np.testing.assert_allclose(select.of_pair(first, pair).threshold, scale, rtol=1e-12)
     best = int(np.argmax(scores_of(estimators.Msac(float(scale)), F, pair)))
     np.testing.assert_array_equal(select(Candidates(F, True, pair), pair).F, F[best])
+    own: Any = estimators.Ransac(select={"score": {"name": "msac", "threshold": 1.0}, "scale": 1.0, "own_noise": 1.5})
+    assert own.select.of_pair(first, pair).threshold == 1.0
 
 
 @pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
