@@ -4,7 +4,7 @@ The parameters of a pair are (omega, tau, log f0, log f1, lambda0, lambda1): R i
 translation moves along two unit tangents, ``t + B tau``, so that both are in radians; lambda is of the division model.
 The information of a fit that minimises the robust sum of w rho(r^2) with a loss truncated at T is J^T W J over the
 matches within T, J being the derivative of the Sampson distance in the photograph (Hartley & Zisserman 2004, 11.4.3),
-with four corrections:
+with five corrections:
 
 1. A truncated fit does not use all that its inliers know: its variance is E[psi^2] / E[psi']^2 of that of one match
    (Huber 1981, Robust Statistics, chapter 7). With c = T / s, A = P(|z| < c) and m = A - 2 c phi(c), which both
@@ -18,6 +18,8 @@ with four corrections:
    camera that only turns seems to have a direction, known to some ten degrees. Where a rotation explains the matches
    up to their noise, nothing is left.
 4. Where neighbours err alike, as in dense matches, so many tell less: see `noise_inflation`.
+5. Where there is little parallax, a wrong match beside its epipolar line has a hundred times as much and would decide
+   the direction of translation alone: matches with `OUTLYING` times the median's tell nothing.
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965)."""
 
@@ -43,6 +45,7 @@ MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estim
 ROTATION_STEPS, ROTATION_SCALE = 6, 9.0  # of the fit of a rotation, and of its loss (Cauchy's), in variances
 CHI_MEDIAN, MEDIAN_DEVIATION = 1.3862943611198906, 1.4426950408889634  # of chi squared of two degrees, ln 4; relative,
 MEDIAN_DEVIATIONS = 4.0  # of the median of n, times sqrt(n)
+OUTLYING = 10.0  # medians of parallax; of right matches so much have those at a tenth of the usual depth
 CELLS = 24  # to the longer side of the box of matches, of a grid that tells how neighbours err
 INDEPENDENT = 1.2  # inflation beyond which are 2 to 7 % of fits to 150 to 10,000 matches with independent noise
 TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
@@ -99,10 +102,11 @@ def residual_slopes(
     return r, J, noise
 
 
-def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, near: Tensor) -> Tensor:
-    """Whether points (2, b, n) move as a rotation near R (3, 3, b) says, up to their noise s (b, n): (b,).
-    The rotation is fitted to the matches `near` (b, n), robustly; then half of its squared distances, in units of their
-    variance 2 s^2, are below the median of chi squared of two degrees, ln 4, as far as so many tell it."""
+def beside_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """How far points (2, b, n) are from where a rotation near R (3, 3, b) turns them, in medians of that (b, n), and
+    whether they are there up to their noise s (b, n): (b,). The rotation is fitted to the matches `near` (b, n),
+    robustly; then half of its squared distances, in units of their variance 2 s^2, are below the median of chi squared
+    of two degrees, ln 4, as far as so many tell it."""
     ones, count = torch.ones_like(a0[:1]), near.sum(-1)
     rays = torch.cat([a0 / f[0, :, None], ones])
     target = a1 / f[1, :, None]
@@ -129,7 +133,8 @@ def explained_by_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tenso
     middle = ((count - 1).clamp_min(0) // 2)[:, None]
     median = ordered.gather(-1, middle)[:, 0] if ordered.shape[-1] else torch.full_like(f[0], torch.inf)
     limit = CHI_MEDIAN * (1 + MEDIAN_DEVIATIONS * MEDIAN_DEVIATION / sqrt(count.to(f).clamp_min(1)))
-    return (count > PINHOLES) & (median < limit)
+    parallax = sqrt(squared / median.clamp_min(CHI_MEDIAN)[:, None])
+    return parallax, (count > PINHOLES) & (median < limit)
 
 
 def kept_share(c: Tensor) -> Tensor:
@@ -303,11 +308,12 @@ def two_view_covariance(
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
     near = (w > 0) & (r < torch.minimum(T, WINDOW * s)[:, None])
     w = torch.where(r < T[:, None], w, 0.0)
+    straight0, straight1 = ((h[:2] / h[2]).to(kind) for h in (lifted(a0, bend0), lifted(a1, bend1)))
+    moved, still = beside_rotation(straight0, straight1, R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
+    w = torch.where(moved < OUTLYING, w, 0.0)
     inflation = torch.empty(len(w), 1, dtype=kind)
     inflation = for_each_pair(noise_inflation, (x0.to(kind), w * error), out=inflation, kind=kind)[:, 0]
     information, from_noise = information_of(r, J, in_slopes, w, T, s, inflation)
-    straight0, straight1 = ((h[:2] / h[2]).to(kind) for h in (lifted(a0, bend0), lifted(a1, bend1)))
-    still = explained_by_rotation(straight0, straight1, R.movedim(0, -1), f.movedim(0, -1), n * s[:, None], near)
     precision = torch.where(known[:, 2:], 0.0, lenses.precision.to(kind))
     C = _without_noise(_covariance(information, Pi.movedim(0, -1), precision.T, used), from_noise, still)
     V = _of_fundamental(C[:PINHOLES, :PINHOLES], F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
