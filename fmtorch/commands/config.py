@@ -179,7 +179,9 @@ def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
             others.append(word)
             continue
         name, given, value = word.partition("=")
-        if name.startswith("--") and not any(flag.startswith(name) for flag in known):
+        if name in ("--config-name", "-cn", "--config-path", "-cp"):
+            raise ValueError(f"{name}: each command has its own config; presets of your own: --config-dir FOLDER")
+        if name not in known and not (name.startswith("--") and any(flag.startswith(name) for flag in known)):
             option = name.lstrip("-").replace("-", "_")
             value = value if given else rest[0] if rest and not rest[0].startswith("-") else "VALUE"
             raise ValueError(f"{name}: options have no dashes: {option}={value}")

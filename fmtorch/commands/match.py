@@ -32,7 +32,7 @@ from fmtorch.metrics import nsgd
 from fmtorch.pipeline import FolderMatches, MatchResult, PhotographCameras, Pipeline, build_pipeline, match
 from fmtorch.pipeline import folder as folders
 from fmtorch.presets.composition import execution_of, read_fields
-from fmtorch.runs import CachedFeatures, cached, fmtorch_version
+from fmtorch.runs import CachedFeatures, cached, fmtorch_version, image_digest
 
 
 def match_folder(
@@ -102,6 +102,8 @@ def match_folder(
 def _expect_some(work: FolderMatches, pairs: int) -> None:
     for trouble in work.troubles:
         errors.print(trouble, style="bold", soft_wrap=True)
+    for trace in work.tracebacks:
+        errors.print(trace, soft_wrap=True)
     if work.taken:
         console.print(f"{work.taken} of {files.counted(pairs, 'pair')} taken from an earlier run")
     if work.troubles and not work.done + work.taken:
@@ -175,7 +177,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     settings = {
         "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed, "orient": fields.orient,
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
-        "cameras": cameras.identity.get("cameras"), "lens": fields.lens,
+        "cameras": cameras.identity.get("cameras"), "lens": fields.lens, "digests": [*map(image_digest, images)],
     }  # fmt: skip
     folder = fields.output or _default_output(paths, settings)
     files.expect_writable(folder)

@@ -36,6 +36,8 @@ def run(config: DictConfig, estimator: str) -> Verification:
         errors.print(problem, style="bold", soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
         errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more")
+    for trace in result.tracebacks[:MAX_PROBLEMS]:
+        errors.print(trace, soft_wrap=True)
     for warning in result.warnings[:MAX_PROBLEMS]:
         errors.print(f"warning: {warning}", soft_wrap=True)
     if result.kept == result.pairs and not result.configurations:

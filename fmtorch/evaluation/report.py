@@ -208,7 +208,7 @@ def _details(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> It
             own, others = _pruners(mine), [_pruners(value) for value in values]
             if any(list(other) != list(own) for other in others):
                 yield "+".join(own) or "no pruner"
-            yield from _words(dict(_options(own, others)))
+            yield from _words(dict(_options(own, [{**own, **other} for other in others])))
         elif isinstance(mine, Mapping):
             yield from _stage(group, mine, [value for value in values if isinstance(value, Mapping)])
         elif group == "version":
@@ -249,13 +249,20 @@ def _pruners(value: Any) -> dict[str, Any]:
 
 
 def _options(mine: Mapping[str, Any], values: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
-    """The options that others have with another value, by their shortest unambiguous names."""
-    own, others = dict(files.leaves(dict(mine))), [dict(files.leaves(dict(value))) for value in values]
+    """The options that others have with another value or not at all, by their shortest unambiguous names."""
+    own, *others = (dict(_leaves(value)) for value in (mine, *values))
     for key, text in own.items():
-        if not key.endswith("_target_") and any(other.get(key, text) != text for other in others):
+        if key != "_target_" and any(other.get(key) != text for other in others):
             parts = key.split(".")
             endings = [".".join(parts[i:]) for i in range(len(parts) - 1, -1, -1)]
             yield next(end for end in endings if sum(f".{other}".endswith(f".{end}") for other in own) == 1), text
+
+
+def _leaves(value: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Options and their texts; of one that is itself an object its class as well."""
+    for key, text in files.leaves(dict(value)):
+        option = key.removesuffix("._target_")
+        yield option, text if option == key else text.rpartition(".")[2]
 
 
 Row = Mapping[str, Any]  # what a run stored of a pair

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.failures import in_a_line
+from fmtorch.core.failures import in_a_line, own_traceback
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import DataError, ImagePair, ImageSource, read_image
 from fmtorch.geometry import cross_matrix, pose_from_fundamental
@@ -289,7 +289,7 @@ def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -
                 return task.image
             return describe(pipeline, read_image(task.image, orient=task.orient), task.longest_side)
     except Exception as error:  # one image, or one pair, does not end the work on the others
-        return in_a_line(error)
+        return f"{in_a_line(error)}\n{own_traceback(error)}"
 
 
 def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> WorkerPool:
@@ -318,6 +318,7 @@ class FolderMatches:
         self.source: Source[Pipeline] = Local(pipeline) if build is None else Factory(build)
         self.done = self.taken = self.related = self._failed = 0
         self._troubles: dict[tuple[Path, ...], str] = {}
+        self.tracebacks: dict[str, None] = {}  # of the user's own parts, in order
         self._described: OrderedDict[Path, Described | None] = OrderedDict()  # None: it cannot be
 
     @property
@@ -401,7 +402,8 @@ class FolderMatches:
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
     def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
-        trouble = result if isinstance(result, str) else self._not_stored(task, result)
+        trouble, _, trace = (result if isinstance(result, str) else self._not_stored(task, result)).partition("\n")
+        self.tracebacks |= {trace: None} if trace else {}
         if isinstance(task, Photograph):
             self._described[task.path] = None if trouble else result
             self._troubles |= {(task.path,): trouble} if trouble else {}

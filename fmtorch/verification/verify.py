@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from fmtorch import presets
 from fmtorch.core import checks, claim, replacing, stages, terminal
+from fmtorch.core.failures import own_traceback
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.core.version import __version__
 from fmtorch.io import colmap
@@ -148,7 +149,8 @@ class Verification:
     path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
     of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many of
     each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
-    again. warnings: what of a camera was not believed, a line each. seconds: of the whole."""
+    again. seconds: of the whole. warnings: what of a camera was not believed, a line each. tracebacks: of an estimator
+    of the user's own."""
 
     path: Path
     pairs: int
@@ -157,6 +159,7 @@ class Verification:
     problems: tuple[str, ...]
     seconds: float
     warnings: tuple[str, ...] = ()
+    tracebacks: tuple[str, ...] = ()
 
     @property
     def verified(self) -> int:
@@ -209,7 +212,7 @@ def estimate_batch(estimator: stages.Estimator, batch: Batch) -> Geometries:
             if len(alike) > 1:
                 groups += [[i] for i in alike]
             else:
-                problems.append((batch.ids[alike[0]], terminal.error_line(error)))
+                problems.append((batch.ids[alike[0]], f"{terminal.error_line(error)}\n{own_traceback(error)}"))
             continue
         configuration = pair_type.classify(c, estimate, focal_deviation=0, seed=batch.mode.seed)
         of_these = pair_geometries([batch.pairs[i].matches for i in alike], c, estimate, configuration)
@@ -244,6 +247,7 @@ class VerificationRun:
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
         self.warnings: dict[str, None] = {}  # in order
+        self.tracebacks: dict[str, None] = {}
 
     def each_batch(self, source: Source[stages.Estimator], report: Callable[[int, int], None]) -> None:
         """Estimate and keep the pairs that are not done, batch by batch."""
@@ -269,7 +273,8 @@ class VerificationRun:
     def result(self, path: Path, seconds: float) -> Verification:
         """The summary."""
         kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
-        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds, tuple(self.warnings))
+        texts = tuple(self.warnings), tuple(self.tracebacks)
+        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds, *texts)
 
     def _counted(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> Iterator[tuple[_PairIds, PairGeometry]]:
         for ids, geometry in geometries:
@@ -293,7 +298,10 @@ class VerificationRun:
 
     def _keep(self, batch: Batch, result: Geometries) -> None:
         geometries, problems = result
-        self.problems += [f"{self._names(pair)}: {problem}" for pair, problem in (*batch.problems, *problems)]
+        for pair, problem in (*batch.problems, *problems):
+            line, _, trace = problem.partition("\n")
+            self.problems.append(f"{self._names(pair)}: {line}")
+            self.tracebacks |= {trace: None} if trace else {}
         if geometries:
             self.parts.write(self._counted(geometries))
 

@@ -98,6 +98,8 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),
         ("eval limitt=2", "no option limitt; there are: limit"),
         ("eval --limit 5", "--limit: options have no dashes: limit=5"),
+        ("eval -s 5", "-s: options have no dashes: s=5"),
+        ("eval --config-name x", "--config-name: each command has its own config"),
         ("match a.png b.png --longest-side", "--longest-side: options have no dashes: longest_side=VALUE"),
         ("match .", ". is a folder; fmtorch match images=. matches its images with one another"),
         ("eval --config-dir nowhere", "nowhere' not found"),

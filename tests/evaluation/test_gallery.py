@@ -172,6 +172,9 @@ def test_names_tell_options_of_one_preset_and_classes_of_ones_own() -> None:
     other = {**mine, "estimator": {"_target_": "my.package.Mine", "threshold": 2.0}}
     assert names(mine, config()) == ["Mine", "ransac"]
     assert names(mine, other) == ["threshold=1.0", "threshold=2.0"]
+    bare, parts = {"_target_": "my.package.Mine"}, [{"score": {"_target_": f"my.package.{name}"}} for name in "AB"]
+    assert names(mine, {**mine, "estimator": bare}) == ["threshold=1.0", "Mine"]
+    assert names(*({**mine, "estimator": {**bare, **part}} for part in parts)) == ["score=A", "score=B"]
     assert names({"pipeline": "theirs"}, {}) == ["theirs", "run"]
     assert names({"pipeline": "theirs"}, config("theirs"))[0] == "theirs"  # it says nothing of its stages
     # Identities tell apart what names do not: more options than a name tells.

@@ -163,6 +163,7 @@ def test_what_an_estimator_raises_is_of_its_pair_alone(tmp_path: Path) -> None:
     result = fmtorch.verify(matches=save(tmp_path / "matches.npz", arrays), **given)
     assert result.verified == 1
     assert [text.partition(" (")[0] for text in result.problems] == ["b/x0, b/x1: ZeroDivisionError: too few"]
+    assert [trace.count('raise ZeroDivisionError("too few")') for trace in result.tracebacks] == [1]
     for minimum, said in ((1000, "ZeroDivisionError: too few"), (0, "FailsOnFew returned None; it must return")):
         result = fmtorch.verify(matches=tmp_path / "matches.npz", minimum=minimum, force=True, **given)
         assert [said in line for line in result.problems] == [True, True]
