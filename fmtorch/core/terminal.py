@@ -1,6 +1,7 @@
 """What the commands share: the console, progress bars, and how errors end a command."""
 
 import contextlib
+import functools
 import math
 import sys
 import time
@@ -86,9 +87,10 @@ def error_line(error: BaseException) -> str:
 @contextlib.contextmanager
 def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
     """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback.
-    Interrupted, with status 130 and a line: `interrupted`, and what was kept. Warnings within are a line each."""
+    Interrupted, with status 130 and a line: `interrupted`, and what was kept. Warnings within are a line each, once."""
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: errors.print(f"warning: {message}", soft_wrap=True)
+        say = functools.cache(lambda text: errors.print(text, soft_wrap=True))
+        warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
             yield
         except KeyboardInterrupt as stop:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+import fmtorch.commands.config  # noqa: F401  # which lets Hydra 1.3 run on Python 3.14
 from fmtorch.core.files import conf_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.local_feature import PatchNetwork, network_file
