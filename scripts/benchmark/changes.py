@@ -12,6 +12,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
+import scipy.spatial
 import torch
 from jaxtyping import Bool
 from numpy.typing import NDArray
@@ -34,6 +36,9 @@ MAX_RIGHT = 150  # in the sweep of inlier ratios
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0)  # px
 MAX_MATCHES = 500  # in the sweep of noise
 COUNTS = (20, 50, 100, 300, 1000, 4000)
+DENSE, DENSE_NOISE, PATCH = (500, 2000, 5000, 20_000, 50_000), 0.5, 6.0  # px; of a Gaussian whose pixels err alike
+REGIONS, WRONG_REGIONS, WRONG_MOVE = 40, 8, 40.0  # px
+VISIBLE = 0.02  # relative difference of depths up to which a point is seen in both images
 OFF_PLANE = 0.1  # share of right matches that are left off the plane
 WINDOW = 0.6  # of width and height
 ZOOM = 2.5
@@ -42,13 +47,15 @@ ZOOM = 2.5
 class Case(NamedTuple):
     """A pair with its matches, the right and the wrong told by its true F.
     c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
-    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away."""
+    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away.
+    depth: of points of an image, where the data set knows it."""
 
     pair: ImagePair
     c: Correspondences
     right: Bool[Tensor, " n"]
     wrong: Bool[Tensor, " n"]
     spare: Correspondences
+    depth: Callable[..., NDArray[np.float64]] | None = None
 
     def subset(self, index: Tensor) -> Case:
         """Some of the matches: a mask or indices."""
@@ -131,6 +138,33 @@ def match_count(case: Case, count: float) -> Case | None:
     """So many of the matches, chosen at random; a smaller choice is part of a larger one."""
     order = case.rng("count").permutation(len(case.right))
     return case.subset(torch.from_numpy(order[: int(count)])) if len(order) >= count else None
+
+
+def dense(case: Case, count: int) -> Case | None:
+    """So many pixels of image 0 that image 1 sees, by their depth, as a dense matcher gives them; as `match_count`.
+    Neighbours err alike; whole regions are wrong and move as one. The score of most wrong ones is below that of most
+    right ones."""
+    pair, rng = case.pair, case.rng("dense")
+    if case.depth is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
+        return None
+    (h, w), size1 = (size.astype(np.int64) for size in case.sizes())
+    errors = scipy.ndimage.gaussian_filter(rng.normal(size=(h, w, 2)), (PATCH, PATCH, 0), mode="wrap").reshape(-1, 2)
+    x0 = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(np.float64)
+    region = scipy.spatial.cKDTree(rng.uniform([0, 0], [w, h], (REGIONS, 2))).query(x0)[1]
+    X = np.c_[x0, np.ones(h * w)] @ np.linalg.inv(pair.K0).T * case.depth(pair.image0, x0)[:, None] @ pair.R.T + pair.t
+    x1 = (X @ pair.K1.T)[:, :2] / X[:, 2:]
+    seen = (np.abs(case.depth(pair.image1, x1) / X[:, 2] - 1) < VISIBLE) & (X[:, 2] > 0)
+    moves = rng.normal(0, WRONG_MOVE, (REGIONS, 2)) * (np.arange(REGIONS) < WRONG_REGIONS)[:, None]
+    x1 += errors * (DENSE_NOISE / errors.std()) + moves[region]
+    kept = rng.permutation(np.flatnonzero(seen & (x1 > 0).all(1) & (x1 < size1[::-1] - 1).all(1)))[:count]
+    right = region[kept] >= WRONG_REGIONS
+    score = 1 / (1 + np.exp(-rng.normal(np.where(right, 1.5, -1.5), 1.0)))
+    ends = {name: torch.from_numpy(x[kept][None]) for name, x in (("x0", x0), ("x1", x1))}
+    known = {name: getattr(case.c, name) for name in ("size0", "size1", "key")}
+    c = Correspondences(**ends, mask=torch.ones(1, len(kept), dtype=torch.bool), **known)
+    c = c.replace(score=torch.from_numpy(score[None]))
+    labels = torch.from_numpy(right), torch.from_numpy(~right)
+    return Case(pair, c, *labels, case.spare) if len(kept) == count else None
 
 
 def plane(case: Case) -> Case | None:
@@ -252,5 +286,6 @@ SWEEPS: dict[str, dict[Level, Change]] = {
     "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
     "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
     "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
+    "dense": {float(count): functools.partial(dense, count=count) for count in DENSE},
     CONDITIONED: CONDITIONS,
 }

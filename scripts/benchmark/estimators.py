@@ -189,16 +189,17 @@ def run_stress(arguments: argparse.Namespace) -> None:
 
 def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
     """The pairs that are asked for, families in turn, with the SIFT matches that pass the ratio test, changed."""
-    families: dict[str, list[ImagePair]] = {}
+    families, depths = dict[str, list[ImagePair]](), dict[str, Any]()
     for dataset in pairs.sets_of(arguments):
         limit = (arguments.limit + 1) // 2 if dataset.name == "rendered" else arguments.limit
         for pair in select([dataset[i] for i in range(len(dataset))], limit):
             families.setdefault(pair.family, []).append(pair)
+            depths[pair.identity] = getattr(dataset, "depth", None)
     front = pairs.front_of("sift", [], memory=IMAGES)
 
     def case_or_none(pair: ImagePair) -> Case | None:
         c = front.correspondences([pair])[0].correspondences
-        case = None if c is None else case_of(pair, c)
+        case = None if c is None else case_of(pair, c)._replace(depth=depths[pair.identity])
         return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
 
     for turn in itertools.zip_longest(*families.values()):  # an interrupted run has some of each family
