@@ -98,7 +98,6 @@ def features(stage: Any, pair: Pair, kind: str) -> Array:
 
 
 def fit(columns: list[Array], own: list[Pair]) -> Array:
-    """Logistic regression; each pair has weight 1."""
     start = np.zeros(columns[0].shape[1])
     return np.asarray(minimize(lambda w: sum(loss(X @ w, p.right) for X, p in zip(columns, own, strict=True)), start).x)
 

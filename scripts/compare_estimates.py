@@ -74,7 +74,6 @@ def with_gradients(name: str, value: torch.Tensor, asked: dict[str, torch.Tensor
 
 
 def geometry() -> dict[str, torch.Tensor]:
-    """Public functions on random input, with gradients."""
     from fmtorch import geometry as g
 
     rng = torch.Generator().manual_seed(0)

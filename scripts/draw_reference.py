@@ -21,7 +21,6 @@ PAGES = ROOT / "docs" / "reference"
 
 
 def text(comment: str) -> str:
-    """A comment as the text of a cell of a table."""
     parts = re.split(r"(`[^`]*`)", comment.strip())
     plain = [re.sub(r"([*_<\[\]])", r"\\\1", part) if i % 2 == 0 else part for i, part in enumerate(parts)]
     return "".join(plain).replace("|", "\\|")

@@ -39,7 +39,6 @@ def lines(paths: Iterable[Path]) -> list[int]:
 
 
 def nodes(paths: Iterable[Path], *kinds: type[ast.AST]) -> list[Any]:
-    """The nodes of these kinds in the syntax trees of files."""
     return [node for path in paths for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, kinds)]
 
 
@@ -77,14 +76,12 @@ def exported(package: str) -> tuple[str, ...]:
 
 
 def words() -> dict[str, int]:
-    """The words of each page that people write."""
     pages = [*ROOT.glob("docs/**/*.md"), *(ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING"))]
     pages = [page for page in pages if page.parent.name != "reference"]
     return {str(page.relative_to(ROOT)): len(page.read_text(encoding="utf-8").split()) for page in pages}
 
 
 def printed(code: str, **environment: str) -> list[str]:
-    """The words that a fresh process prints."""
     command, variables = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": str(ROOT), **environment}
     return subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
 

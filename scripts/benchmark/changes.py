@@ -58,7 +58,6 @@ class Case(NamedTuple):
     depth: Callable[..., NDArray[np.float64]] | None = None
 
     def subset(self, index: Tensor) -> Case:
-        """Some of the matches: a mask or indices."""
         return self._replace(c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
 
     def rng(self, *names: float | str) -> np.random.Generator:
@@ -145,26 +144,25 @@ def dense(case: Case, count: int) -> Case | None:
     Neighbours err alike; whole regions are wrong and move as one. The score of most wrong ones is below that of most
     right ones."""
     pair, rng = case.pair, case.rng("dense")
-    if case.depth is None or pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None:
+    if case.depth is None:
         return None
+    K0, K1, R, t = (np.asarray(each) for each in (pair.K0, pair.K1, pair.R, pair.t))
     (h, w), size1 = (size.astype(np.int64) for size in case.sizes())
     errors = scipy.ndimage.gaussian_filter(rng.normal(size=(h, w, 2)), (PATCH, PATCH, 0), mode="wrap").reshape(-1, 2)
-    x0 = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(np.float64)
+    x0 = np.mgrid[:h, :w][::-1].reshape(2, -1).T.astype(np.float64)
     region = scipy.spatial.cKDTree(rng.uniform([0, 0], [w, h], (REGIONS, 2))).query(x0)[1]
-    X = np.c_[x0, np.ones(h * w)] @ np.linalg.inv(pair.K0).T * case.depth(pair.image0, x0)[:, None] @ pair.R.T + pair.t
-    x1 = (X @ pair.K1.T)[:, :2] / X[:, 2:]
+    X = np.c_[x0, np.ones(h * w)] @ np.linalg.inv(K0).T * case.depth(pair.image0, x0)[:, None] @ R.T + t
+    x1 = (X @ K1.T)[:, :2] / X[:, 2:]
     seen = (np.abs(case.depth(pair.image1, x1) / X[:, 2] - 1) < VISIBLE) & (X[:, 2] > 0)
     moves = rng.normal(0, WRONG_MOVE, (REGIONS, 2)) * (np.arange(REGIONS) < WRONG_REGIONS)[:, None]
     x1 += errors * (DENSE_NOISE / errors.std()) + moves[region]
     kept = rng.permutation(np.flatnonzero(seen & (x1 > 0).all(1) & (x1 < size1[::-1] - 1).all(1)))[:count]
     right = region[kept] >= WRONG_REGIONS
     score = 1 / (1 + np.exp(-rng.normal(np.where(right, 1.5, -1.5), 1.0)))
-    ends = {name: torch.from_numpy(x[kept][None]) for name, x in (("x0", x0), ("x1", x1))}
-    known = {name: getattr(case.c, name) for name in ("size0", "size1", "key")}
-    c = Correspondences(**ends, mask=torch.ones(1, len(kept), dtype=torch.bool), **known)
-    c = c.replace(score=torch.from_numpy(score[None]))
-    labels = torch.from_numpy(right), torch.from_numpy(~right)
-    return Case(pair, c, *labels, case.spare) if len(kept) == count else None
+    fields = {name: torch.from_numpy(v[None]) for name, v in (("x0", x0[kept]), ("x1", x1[kept]), ("score", score))}
+    fields |= {name: getattr(case.c, name) for name in ("size0", "size1", "key")}
+    c = Correspondences(**fields, mask=torch.ones(1, len(kept), dtype=torch.bool))
+    return Case(pair, c, torch.from_numpy(right), torch.from_numpy(~right), case.spare) if len(kept) == count else None
 
 
 def plane(case: Case) -> Case | None:

@@ -160,7 +160,6 @@ def curve_sheet(curves: Sequence[Curve], results: Results, figures: Figures, kne
 
 
 def draw_curves(curves: Sequence[Curve], results: Results, knees: Mapping[str, str], path: Path) -> None:
-    """AUC@0.05 against milliseconds, a panel for wide and one for short baselines."""
     panels: dict[str, dict[str, tables.Line]] = {}
     for group, own in _shown(results).items():
         for curve in curves:
@@ -273,7 +272,6 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
 
 
 def draw_inlier_ratios(rows: Sequence[Row], path: Path) -> None:
-    """AUC@0.05 against the inlier ratio, a panel for each set."""
     panels: dict[str, dict[str, tables.Line]] = {}
     for _, level, results in by_level([row for row in rows if row["sweep"] == "inlier ratio"]):
         for (name, own), estimator in itertools.product(results.by_family(results.pairs()).items(), results.methods):

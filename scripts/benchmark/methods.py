@@ -43,7 +43,6 @@ def specs_of(words: Sequence[str], file: Path | None) -> list[str]:
 
 
 def read_specs(path: Path) -> list[str]:
-    """One method a line, without comments."""
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
 
 

@@ -37,7 +37,6 @@ def add_set_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_match_options(parser: argparse.ArgumentParser) -> None:
-    """Those, and the options that say which matches all methods get."""
     add_set_options(parser)
     parser.add_argument("--features", default="sift")
     parser.add_argument("--matcher", default="nearest", help="PRESET[:KEY=VALUE,...], as lightglue, without --pruners")
@@ -46,7 +45,6 @@ def add_match_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
-    """Those, and the options of tables that compare methods."""
     add_match_options(parser)
     parser.add_argument("--specs", type=Path, help="a file with one method a line; # starts a comment")
     parser.add_argument("--shares", type=float, nargs="*", default=[], help="group pairs by right matches: 0.4 0.7")
@@ -96,7 +94,6 @@ def matches_identity(arguments: argparse.Namespace) -> str:
 
 
 def matched(arguments: argparse.Namespace) -> list[Item]:
-    """Every pair of the sets that are asked for, with its matches."""
     front = front_of(arguments.features, arguments.pruners, arguments.cache, matcher=arguments.matcher)
     return items(pairs_of(arguments), front)
 
@@ -144,7 +141,6 @@ def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
 
 
 def synthetic_matches(index: int, matches: int, spread: float = 0.5) -> Correspondences:
-    """The matches of `synthetic_pair`, a batch of one."""
     pair = synthetic_pair(index, matches, spread)
     assert pair.matches is not None
     return pair.matches().correspondences

@@ -242,7 +242,6 @@ def rates_sheet(rows: Rows) -> Sheet:
 
 
 def levels_sheet(rows: Rows) -> Sheet:
-    """Points of the ROC curve: unrelated pairs accepted and right ones rejected at several levels."""
     records: list[Record] = []
     for name, own in rows.items():
         unrelated, good = ([row["significance"] for row in part] for part in split(own))
@@ -253,7 +252,6 @@ def levels_sheet(rows: Rows) -> Sheet:
 
 
 def sets_sheet(rows: Rows) -> Sheet:
-    """By set: pairs called related, of those whose estimate is right and of others."""
     records: list[Record] = []
     every = [row for own in rows.values() for row in own]
     for (family, name), own in sorted(tables.grouped(every, "family", "method").items(), key=lambda each: each[0][0]):

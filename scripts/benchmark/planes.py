@@ -120,7 +120,6 @@ def estimated(c: Correspondences, seed: int = 0, **changed: Any) -> Estimate:
 
 
 def _solved(name: str, setting: str, c: Correspondences, seed: int) -> Array | None:
-    """By ours, PoseLib, fastpose or a method of OpenCV."""
     if name == "ours":
         estimate = estimated(c, seed, **options(setting))
         return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
@@ -318,7 +317,6 @@ def kinds(paths: Sequence[Path]) -> Iterator[Plane]:
 
 
 def _with_cameras(group: str, truth: str, path: Path, c: Correspondences, focals: Array | None) -> Plane:
-    """Cameras of square pixels; focals: (2,) px."""
     sizes = sizes_of(c)
     known = [FOCAL * max(size) for size in sizes] if focals is None else focals
     K0, K1 = (calibration(f, (h, w)) for f, (h, w) in zip(known, sizes, strict=True))
@@ -345,14 +343,12 @@ def _rotated(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array,
 
 
 def _copied(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
-    """The photograph, and a copy of another size and compression."""
     scale = rng.choice([1.0, rng.uniform(0.5, 1.0)])
     copy = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return photograph, _compressed(copy, int(rng.integers(50, 95))), None
 
 
 def _cropped(rng: np.random.Generator, photograph: Array) -> tuple[Array, Array, None]:
-    """The photograph, and a part of 60 to 90 % of its sides."""
     h, w = photograph.shape[:2]
     share = rng.uniform(0.6, 0.9)
     height, width = round(share * h), round(share * w)
@@ -374,7 +370,6 @@ MAKERS: dict[str, tuple[str, str, Callable[..., tuple[Array, Array, Array | None
 
 
 def small(path: Path) -> Array:
-    """A photograph whose longer side is SIDE, BGR."""
     image = np.asarray(read_image(path)[..., ::-1])
     scale = SIDE / max(image.shape[:2])
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))

@@ -187,7 +187,6 @@ def _timed(executor: str, workers: int, seconds: float, count: int) -> float:
 
 
 def wait(seconds: float, job: int) -> int:
-    """A stage that only waits."""
     time.sleep(seconds)
     return job
 
@@ -289,7 +288,6 @@ def run_end_to_end(arguments: argparse.Namespace) -> None:
 
 
 def own_stages(pipeline: Pipeline, pair: ImagePair, image0: Image, image1: Image) -> tuple[Seconds, int]:
-    """Of our pipeline; and how many features an image has on average."""
     clock = Clock(STAGES)
     features0, features1 = pipeline.extractor(image0), pipeline.extractor(image1)
     clock.stage("features")
@@ -317,7 +315,6 @@ def opencv_stages(method: int, threshold: float, image0: Image, image1: Image, f
 
 
 def _estimated(clock: Clock, x0: NDArray[Any], x1: NDArray[Any], method: int, threshold: float) -> Seconds:
-    """The seconds of a peer when it has matches, F included."""
     clock.stage("pruning")
     if len(x0) >= 8:
         cv2.findFundamentalMat(x0, x1, method, threshold, 0.9999, 10000)

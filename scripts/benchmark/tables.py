@@ -27,8 +27,6 @@ Get = Callable[[str], Values]  # a field of the rows, (seeds, pairs), NaN where 
 
 
 class Span(NamedTuple):
-    """A figure with its 95 % interval, as text."""
-
     value: str
     low: str
     high: str
@@ -66,7 +64,6 @@ class Sheet(NamedTuple):
         return f"{self.title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
 
     def write(self, path: Path) -> None:
-        """As CSV, one value a cell; an interval takes three columns."""
         spans = {c for record in self.records for c, cell in record.items() if isinstance(cell, Span)}
         heads = {c: (c, f"{c} low", f"{c} high") if c in spans else (c,) for c in self.columns}
         with path.open("w", encoding="utf-8", newline="") as file:
@@ -87,7 +84,6 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
 
 
 def grouped(rows: Iterable[Row], *fields: str) -> dict[tuple[Any, ...], list[Row]]:
-    """The rows by the values of some fields."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[field] for field in fields), []).append(row)
@@ -177,7 +173,6 @@ class Results:
         return [pair for pair in self._places if all(pair in self._rows[m] for m in methods or self.methods)]
 
     def scenes(self, pairs: Sequence[str]) -> list[str]:
-        """The scene of each pair, with its family."""
         return scene_names(*zip(*(self._places[pair] for pair in pairs), strict=True)) if pairs else []
 
     def by_family(self, pairs: Sequence[str]) -> dict[str, list[str]]:

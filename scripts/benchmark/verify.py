@@ -167,7 +167,6 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
 
 
 def _options(mapper: str, refined: bool, seed: int) -> Any:
-    """Of COLMAP's mappers. refined: whether intrinsics are estimated."""
     pycolmap = imported()
     own: dict[str, Any] = {"min_model_size": MIN_MODEL, "num_threads": 1, "random_seed": seed}
     if mapper == "global":

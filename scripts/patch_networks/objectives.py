@@ -91,7 +91,6 @@ def patch_quality(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"]) -> dict[str,
 
 
 def middle(patches: Float[Tensor, "*b h w"], size: int = 32) -> Float[Tensor, "*b size size"]:
-    """The middle of patches that were cut with their surroundings."""
     top, left = (patches.shape[-2] - size) // 2, (patches.shape[-1] - size) // 2
     return patches[..., top : top + size, left : left + size]
 
@@ -204,7 +203,6 @@ def sample(patches: Float[Tensor, "n 1 h w"], frame: Float[Tensor, "n 2 2"], siz
 
 
 def _inverse(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
-    """Of matrices of determinant 1."""
     a, b, c, d = matrix.flatten(1).unbind(1)
     return torch.stack([d, -b, -c, a], -1).reshape(-1, 2, 2)
 

@@ -142,7 +142,6 @@ def views_of(image: NDArray[np.uint8], rng: np.random.Generator, limits: PlaneVi
 
 
 def tracks(views: Sequence[View], tolerance: Tolerance) -> Part:
-    """The patches of the points that two or more views show."""
     parts = []
     for i, (view, owner) in enumerate(zip(views, linked([view.there for view in views], tolerance), strict=True)):
         shown = np.flatnonzero(owner >= 0)
@@ -277,7 +276,6 @@ def match_sets(store: PatchStore, matches: int, max_similarity: float = MAX_SIMI
 
 
 def _pairs_of_points(first: NDArray[np.int64]) -> NDArray[np.int64]:
-    """All pairs (2, k) of patches of the same point."""
     counts = np.diff(first)
     parts = [np.zeros((2, 0), np.int64)]
     for length in np.unique(counts[counts >= 2]):

@@ -179,7 +179,6 @@ def cutting_of(config: DictConfig) -> Cutting:
 
 
 def objective_of(config: DictConfig) -> Objective:
-    """The loss of a config, on descriptors or on shapes."""
     loss, taught = plain(config.training.loss), dict[str, Any]()
     if "teacher" in config.training:
         teacher = config.training.teacher
@@ -198,7 +197,6 @@ def objective_of(config: DictConfig) -> Objective:
 def training_of(
     config: DictConfig, network: nn.Module, store: PatchStore, description: dict[str, Any], device: torch.device
 ) -> PatchTraining:
-    """The training of a config: on points of the whole store, or on match sets."""
     training, of_sets = plain(config.training), dict[str, Any]()
     objective = objective_of(config)
     if "match_sets" in training:
