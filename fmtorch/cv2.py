@@ -271,7 +271,6 @@ def _put(value: Any, out: Any) -> None:
 
 
 def __getattr__(name: str) -> Any:
-    """All else is OpenCV's."""
     return getattr(opencv, name)
 
 

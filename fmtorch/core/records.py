@@ -66,7 +66,6 @@ def expectation(hint: Any) -> Expected:
 
 
 def _of_one(hint: Any) -> Expected:
-    """The same of an annotation that is no union."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         rules = [rule for rule in arguments[1:] if isinstance(rule, Rule)]

@@ -213,7 +213,6 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
 
 
 def _frame(solved: dict[int, Solved], like: Tensor) -> PixelFrame:
-    """The normalised coordinates of pairs."""
     pairs = [each.pair for each in solved.values()]
     centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(like)
     return PixelFrame(centre, torch.tensor([pair.pixels_per_unit for pair in pairs]).to(like))

@@ -179,7 +179,6 @@ class GraphCut:
         self.threshold, self.score = threshold, score
 
     def __call__(self, F: Array, pair: Pair) -> Array:
-        """The improved models (k, 9), float64."""
         graph = neighbor_graph(pair, self.RADIUS_PX)
         improved, score = F.copy(), scores_of(self.score, F, pair)
         for m in range(len(F)):

@@ -30,7 +30,6 @@ class WithinThreshold:
         self.threshold = threshold
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
-        """As `InlierRule`."""
         return squared_px <= squared(self.threshold)
 
 
@@ -41,7 +40,6 @@ class BetterHalf:
     """Inliers are the matches at or below the median residual, as MATLAB's LMedS reports them, and the exact ones."""
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
-        """As `InlierRule`."""
         return squared_px <= max(lower_median(squared_px), squared(FLOOR_PX))
 
 
@@ -51,7 +49,6 @@ class RobustDeviations:
     PARAMETERS = 7
 
     def __call__(self, squared_px: Array, pair: Pair) -> Array:
-        """As `InlierRule`."""
         spare = max(pair.count - self.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(lower_median(squared_px))
         return squared_px <= squared(max(2.5 * sigma, FLOOR_PX))

@@ -352,7 +352,6 @@ def _round(at: Array, prior: LensPrior, pair: Pair, search: FocalSearch) -> list
 
 
 def _from(fit: LensFit, prior: LensPrior, pair: Pair, scale_px: float, iterations: int) -> LensFit:
-    """The fit near another one."""
     return fit_with_lenses(fit.cameras, fit.lens[None], prior, pair, scale_px, iterations)[0]
 
 

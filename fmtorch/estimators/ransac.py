@@ -205,7 +205,6 @@ class Ransac:
         self.focal = self._focal_search(stage(focal, Focal), choice)
 
     def _focal_search(self, options: Focal | None, choice: refinement.Select | None) -> FocalSearch | None:
-        """The search among plausible cameras."""
         if options is None:
             return None
         if choice is None:

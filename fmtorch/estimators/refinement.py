@@ -88,7 +88,6 @@ class Refinement:
         )
 
     def __call__(self, pool: Pool, pair: Pair, family: Matrices) -> Candidates:
-        """The pool with refined models."""
         F, near = pool.models, self.near(pool, pair)
         if self.local_optimization is not None:
             F = self.local_optimization(F, pair)
@@ -143,7 +142,6 @@ class BestScore:
         self.score, self.at_noise = score, at_noise
 
     def __call__(self, candidates: Candidates, pair: Pair) -> Selection:
-        """The selection."""
         first = self.first(candidates, pair)
         return first if self.at_noise is None else _largest(self.of_pair(first.F, pair), candidates, pair)
 
@@ -226,7 +224,6 @@ class LeastSquares(NoFit):
     gradient, weighted = "least_squares", True
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
-        """As `NoFit`."""
         weighted = self.weighted and pair.prior is not None
         weight = np.where(inliers, pair.weight if weighted else 1.0, 0.0)
         return Fit(family.least_squares(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
@@ -244,7 +241,6 @@ class GaussNewton(NoFit):
     gradient, weighted = "optimum", True
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
-        """As `NoFit`."""
         weight = np.where(inliers, pair.weight, 0.0)
         return Fit(family.step(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
 
@@ -261,7 +257,6 @@ class Adaptive(NoFit):
     gradient, weighted = "optimum", True
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
-        """As `NoFit`."""
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
         own = family.fit_scale
         scale = fit_distance(squared_in_noises(selection.F, pair)[likely], own)

@@ -131,7 +131,6 @@ def _drawn(
 
 
 def _quantised(pair: Pair) -> tuple[Array, Array]:
-    """Weights and cumulative weights."""
     largest = 1.0 if pair.prior is None else largest_weight(pair.bucket)
     weight = np.maximum(np.rint(pair.match_weight * largest).astype(np.int64), 1)
     return weight, np.cumsum(weight)

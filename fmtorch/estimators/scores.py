@@ -103,7 +103,6 @@ class SummedGains:
         raise NotImplementedError(f"{type(self).__name__} must override `gain` or name a `gain_kernel`")
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
-        """As `Score`."""
         (rows, gain), out = pair.cached(self, self._matches), np.empty(len(which))
         if self.CODE is not None:
             score_gains_of(pair.residual)(F, which, rows, gain, out)
@@ -285,7 +284,6 @@ class SaturatedGains(SummedGains):
         self.preselection = GemanMcClure(threshold, prior_weighted)
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
-        """As `Score`."""
         rows, gain = pair.cached(self, self._matches)
         cells = pair.cached(("cells", self.prior_weighted), self._cells)
         out = np.empty(len(which))
@@ -363,7 +361,6 @@ class Median:
     prior_weighted = False
 
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
-        """As `Score`."""
         out = np.empty(len(which))
         score_median_of(pair.residual)(F, which, pair.cached("rows of ones", _rows), pair.count, out)
         return out

@@ -71,7 +71,6 @@ def fundamental_from_calibration(K0: Matrix, K1: Matrix, R: Matrix, t: Float[Ten
 
 
 def _matrix(elements: list[Tensor]) -> Tensor:
-    """A 3 x 3 matrix from its nine elements, row by row."""
     stacked = torch.stack(elements, -1)
     return stacked.reshape(*stacked.shape[:-1], 3, 3)
 

@@ -327,7 +327,6 @@ def null_space(A: Array, m: int, B: Array, scale: Array) -> Any:
 
 @inner
 def _dot(A: Array, a: int, B: Array, b: int, n: int) -> Any:
-    """Products of n components from A[a] and B[b] on, summed."""
     total = fill(0.0)
     for c in range(n):
         total += load(A, a + c) * load(B, b + c)

@@ -185,7 +185,6 @@ def _add_products(factors: Array, counted: Any, sums: Array) -> None:
 
 @inner
 def _assemble(sums: Array, products: Array) -> None:
-    """The sums of `_add_products` -> products (10, 10)."""
     place = 0
     for r in range(3):
         for c in range(r, 3):

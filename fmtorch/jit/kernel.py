@@ -212,7 +212,6 @@ class Inner(Generic[P, R]):
         functools.update_wrapper(self, self.function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """The function's value."""
         return self.function(*args, **kwargs)
 
     @functools.cached_property

@@ -151,7 +151,6 @@ class RecordedSample:
         model.sample = self
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """What the model samples, remembered."""
         self._last = self._sample(*arguments, **named)
         return self._last
 

@@ -181,7 +181,6 @@ LIGHTS = 4  # times of day
 
 
 def _gable(surfaces: Surfaces, x: Real, y: Real, z: Real, width: Real, height: Real, deep: Real, stone: int) -> None:
-    """A pediment: a triangular front and two roof planes."""
     left, right, top = vec(x, y, z), vec(x + width, y, z), vec(x + width / 2, y, z + height)
     uv = np.array([[0.0, 1.0], [1.0, 0.0], [0.5, -1.0]]) * np.array([3.0, 1.0])
     surfaces.piece(left, right - left, top - left, stone, uv, triangle=True, both_sides=True)

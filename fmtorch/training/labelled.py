@@ -70,7 +70,6 @@ class LabelledMatches(records.Record):
         return len(self.correspondences)
 
     def __getitem__(self, index: records.Index) -> "LabelledMatches":
-        """The selected pairs, always as a batch."""
         i = records.as_index(index, len(self))
         return self._map(lambda value: value[i])
 

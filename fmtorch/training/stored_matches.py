@@ -84,7 +84,6 @@ class Shard:
 
 
 def _checksum(batch: pa.RecordBatch) -> int:
-    """CRC-32 over the values of all columns."""
     total = 0
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
         total = zlib.crc32(name.encode(), total)

@@ -106,7 +106,6 @@ def expect_possible(c: Correspondences, plane: bool = False) -> None:
 
 
 def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:
-    """Points and what is known of them as tensors of a batch."""
     if fields.get("mask") is None:
         x0, x1 = _one_pair(x0), _one_pair(x1)
     ragged = [name for name, value in (("x0", x0), ("x1", x1)) if _is_list_of_pairs(value)]
@@ -144,7 +143,6 @@ def _one_pair(points: Any) -> Any:
 
 
 def _depth(value: object) -> int:
-    """How deeply lists are nested."""
     if not isinstance(value, list | tuple):
         return int(hasattr(value, "pt"))  # a keypoint of OpenCV
     return 1 + (_depth(value[0]) if value else 0)
@@ -183,7 +181,6 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
 
 
 def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) -> Correspondences:
-    """A padded batch of pairs of different lengths."""
     count = len(x0)
     for name, value in {"x1": x1, **{name: fields[name] for name in PER_MATCH if fields.get(name) is not None}}.items():
         listed = isinstance(value, list | tuple | Tensor | np.ndarray) and getattr(value, "ndim", 1) > 0

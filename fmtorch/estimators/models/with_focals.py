@@ -166,7 +166,6 @@ def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tole
 
 @inner
 def _gain(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, scale: Any) -> Any:
-    """The gains of matches."""
     e, slope = sampson_parts(f, x0, y0, x1, y1)
     gain = 1.0 / (1.0 + e * e / where(slope > TINY_OF_KERNEL, slope, TINY_OF_KERNEL) * scale) - REST
     return where(gain > 0.0, gain, 0.0) * (1 / (1 - REST))
