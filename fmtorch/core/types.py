@@ -19,7 +19,7 @@ from fmtorch.core.records import Index, Record, Rule, as_index, expect_fields, g
 
 MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and its corners in front of the camera
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
-DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
+DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive, or a covariance, positive definite")
 SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
 FOCAL = Rule(
     lambda focal: (
@@ -108,8 +108,8 @@ class Correspondences(Record):
     score: the matcher's own confidence in [0, 1], (B, N); larger is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
     to its epipolar line, relative to that of a usual match, (B, N), where something supplies it. stretch: derivatives
-    (B, N, 2, 2, 2) of the points of both images by those of photographs, from which they were undistorted; the noise
-    is then the root of their areas times that in the photographs.
+    (B, N, 2, 2, 2) of the points of both images by those of photographs, from which they were undistorted, times the
+    root of the covariance there if noise has one; `noise` is then the root of their mean area times that beside it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
     K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.

@@ -18,6 +18,7 @@ from fmtorch.core.options import nearest
 from fmtorch.core.records import Rule
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.geometry.epipolar import mean_stretch
 
 
 @runtime_checkable
@@ -66,6 +67,8 @@ def correspondences(
     wrong shapes, values that cannot be, a calibration that is none, and points of no pixels."""
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
+    if lens is not None and c.stretch is not None:
+        raise ValueError(f"noise of covariances (N, 2, 2) needs a lens that is calibrated, not {lens}; or give (N,)")
     if len(c) == 1 and (problem := camera_problems(c)[0]):
         raise ValueError(problem)
     expect_possible(c, plane)
@@ -125,9 +128,19 @@ def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences
     points0, points1 = (points[None] if single else points for points in (points0, points1.to(points0.device)))
     kind = torch.promote_types(points0.dtype, points1.dtype)
     known = {name: _field(name, value, single, points0) for name, value in fields.items() if value is not None}
+    if (noise := known.get("noise")) is not None and noise.dim() == 4 - single:
+        known |= _of_covariances(noise[None] if single else noise)
     mask = known.pop("mask", None)
     mask = torch.ones_like(points0[..., 0], dtype=torch.bool) if mask is None else mask.to(torch.bool)
     return Correspondences(points0.to(kind), points1.to(kind), mask, **known)
+
+
+def _of_covariances(C: Tensor) -> dict[str, Tensor]:
+    """Noise and `stretch` of matches whose points in image 1 have covariances (b, n, 2, 2): those are its roots."""
+    a, b, d = 2 * C[..., 0, 0], 2 * C[..., 1, 0], 2 * C[..., 1, 1]  # of both images together, as `noise` counts
+    roots = [a.sqrt(), torch.zeros_like(a), b / a.sqrt(), (d - b * b / a).sqrt()]
+    stretch = torch.stack([torch.zeros_like(C), torch.stack(roots, -1).reshape(C.shape)], -3)
+    return {"noise": mean_stretch(stretch, torch.sqrt), "stretch": stretch.detach().nan_to_num()}
 
 
 def _is_list_of_pairs(value: object) -> bool:

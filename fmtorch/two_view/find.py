@@ -65,7 +65,7 @@ def find_fundamental(
             frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
-            it from frames).
+            it from frames); or (B, N, 2, 2), its covariance in image 1, where points of image 0 are exact.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2); assumed from the points' extent when not given,
             unless these are centred; "unknown" assumes nothing.
         K0, K1: calibration matrices, px, (3, 3) for all pairs or (B, 3, 3), of both images or of one. Gradients reach

@@ -116,7 +116,7 @@ def matches_in_sight(c: Correspondences, lenses: Sequence[Lenses]) -> tuple[Corr
     camera; and whether a match is there, for both images.
 
     lenses: of each pair. A match's noise grows as its points are stretched, so that its distances count in pixels of
-    the photographs: by the root of the determinant of the derivatives of its points, in the geometric mean over both
+    the photographs: by the root of the determinant of the derivatives of its points, in the mean over both
     images, until F tells in which direction (`stretch`). Gradients reach the photographs' points."""
     fields, seen = dict[str, Tensor](), np.ones(c.mask.shape, np.bool_)
     behind = np.zeros((*c.mask.shape, 2), np.bool_)
@@ -149,10 +149,13 @@ def matches_in_sight(c: Correspondences, lenses: Sequence[Lenses]) -> tuple[Corr
 def with_stretch(c: Correspondences, stretch: Matrix, seen: NDArray[np.bool_]) -> Correspondences:
     """Matches of undistorted points with their derivatives (b, n, 2, 2, 2) by the photographs', and their noise. seen:
     (b, n), whether a pinhole sees a match."""
-    mean = mean_stretch(stretch)
+    mean, derivatives = mean_stretch(stretch), torch.from_numpy(stretch).to(c.x0)
     noise = torch.from_numpy(np.where(seen & (mean > 0), mean, 1)).to(c.x0)
+    if c.stretch is not None:  # of noise with a direction
+        derivatives = derivatives @ c.stretch.to(c.x0)
+        noise = mean_stretch(derivatives, sqrt) / mean_stretch(c.stretch.to(c.x0), sqrt)
     return c.derived(
-        mask=c.mask & torch.from_numpy(seen).to(c.mask.device), stretch=torch.from_numpy(stretch).to(c.x0),
+        mask=c.mask & torch.from_numpy(seen).to(c.mask.device), stretch=derivatives,
         noise=noise if c.noise is None else c.noise * noise,
     )  # fmt: skip
 
