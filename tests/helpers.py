@@ -34,7 +34,6 @@ def draw(path: Path, seed: int, shift: int = 0) -> ImageSource:
 
 
 def pair(name: str, image0: ImageSource, image1: ImageSource, problem: str | None = None) -> ImagePair:
-    """Two images of a sideways camera."""
     return ImagePair(name, "family", "scene", image0, image1, ROWS / np.sqrt(2), problem=problem)
 
 
@@ -66,12 +65,10 @@ def small_pipeline(**parts: object) -> Pipeline:
 
 
 def unused(*_: object) -> Any:
-    """A stage that has nothing to do."""
     raise AssertionError("this stage has nothing to do")
 
 
 def write_file(path: Path, text: str) -> Path:
-    """A file, and the folders in which it is."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path

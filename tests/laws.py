@@ -136,7 +136,6 @@ def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.
 
 @functools.cache
 def scenes() -> Correspondences:
-    """A batch of pairs of different sizes."""
     return collate([scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150))])
 
 
@@ -222,7 +221,6 @@ def small() -> dict[str, Correspondences]:
 
 
 def assert_same(a: Result, b: Result, what: str) -> None:
-    """Bit-equal, NaN equal to NaN."""
     assert a.keys() == b.keys()
     for name in a:
         assert a[name].shape == b[name].shape, f"{what}: {name} has shapes {a[name].shape} and {b[name].shape}"

@@ -44,7 +44,6 @@ class Command:
         self.status: int | None = None
 
     def kill(self) -> bool:
-        """Kill it; whether it was still running."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
         return self.wait() == -signal.SIGKILL
@@ -114,7 +113,6 @@ class Starter:
         return Command(self, self.ask(job), log)
 
     def run(self, cwd: Path, name: str, *arguments: str, before: str = "") -> Command:
-        """The same to its end."""
         command = self.start(cwd, name, *arguments, before=before)
         command.wait()
         return command

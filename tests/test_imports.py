@@ -77,12 +77,10 @@ def room(module: str) -> str:
 
 
 def within(module: str) -> set[str]:
-    """The files of fmtorch that a file imports."""
     return {name for name in imported(module) if name in FILES}
 
 
 def libraries(module: str) -> set[str]:
-    """The top-level packages that a file imports."""
     return {name.partition(".")[0] for name in imported(module)}
 
 

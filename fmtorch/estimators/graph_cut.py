@@ -82,7 +82,6 @@ def connect(points: F8x2, orders: I8x2, limit: float, window: int, graph: Graph)
 
 @inner
 def _among(members: Array, count: int, wanted: int) -> bool:
-    """Whether a number is one of the first so many."""
     place = 0
     while place < count and members[place] != wanted:
         place += 1
@@ -144,7 +143,6 @@ def _sweep(field: Array, neighbours: Array, degree: Array, weight: Any, labels: 
 
 @inner
 def _energy(labels: Array, K: Array, neighbours: Array, degree: Array, coherence: float) -> float:
-    """E of labels (n,)."""
     unary, pairwise = 0.0, 0.0
     for i in range(len(labels)):
         unary += ONE - K[i] if labels[i] else K[i]

@@ -377,7 +377,6 @@ def _precision(scale_px: float, pair: Pair) -> float:
 
 
 def _model(cameras: Cameras, pair: Pair) -> Array:
-    """The model (9,) of cameras (1, ...), of unit norm."""
     F, out, images = np.empty((1, 9)), np.empty((1, 9)), images_of(pair)
     tangents_of(cameras, images.longest, F, np.zeros((1, 9, LANES)))
     translate(F, images.offset, out)

@@ -212,7 +212,6 @@ class NoFit:
     weighted: bool = False
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
-        """The estimate from the selected model and its inliers (n,)."""
         return Fit(selection.F, selection.F, inliers.astype(np.float64))
 
 

@@ -61,7 +61,6 @@ def _refine(volume: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _linear(volume: Tensor, at: Tensor) -> Tensor:
-    """Position in memory of the samples (M, 3)."""
     _, h, w = volume.shape
     return (at[:, 0] * h + at[:, 1]) * w + at[:, 2]
 

@@ -241,7 +241,6 @@ def _step(matches: Weighted, state: _State, damping: Array, trial: _State) -> No
 
 @inner
 def _stepped(products: Array, h: Array, damping: float, Q: Array, out: Array) -> None:
-    """A damped step of h (9,) on the sphere -> out (9,)."""
     damped_system(products, h, damping, Q)
     for r in range(9):
         Q[2 * r + 1, 9 - LANES] = -products[r, 9]

@@ -122,7 +122,6 @@ def _correspondences(
 
 
 def _tensor(image: Image) -> Float[Tensor, "3 h w"]:
-    """An image as vismatch takes it: RGB, in [0, 1]."""
     channels = np.broadcast_to(image if image.ndim == 3 else image[..., None], (*image.shape[:2], 3))
     return torch.from_numpy(channels.transpose(2, 0, 1).copy()).to(torch.float32) / 255
 

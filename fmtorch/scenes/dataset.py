@@ -246,7 +246,6 @@ _recent = _Recent()
 
 
 def _truth(camera0: Camera, camera1: Camera) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
-    """F, K0, K1, R and t."""
     return fundamental(camera0, camera1), camera0.K, camera1.K, *relative_pose(camera0, camera1)
 
 

@@ -113,7 +113,6 @@ def _built(name: str, config_dir: Path | str | None, options: Mapping[str, Any])
 
 
 def _plain(value: Any) -> Any:
-    """The value with numbers of NumPy as Python's, at any depth."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Mapping):

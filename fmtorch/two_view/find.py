@@ -166,7 +166,6 @@ def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None 
 
 
 def _expect_lens(size: Size, calibrated: bool) -> None:
-    """Raise ValueError where a lens has no place."""
     if isinstance(size, str) or (calibrated and size is None):
         raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 
@@ -350,7 +349,6 @@ def _unit_of_plane(c: Correspondences) -> tuple[Float[Tensor, " b"], Float[Tenso
 
 
 def _moved(c: Correspondences, scale: Tensor, middle: Tensor) -> Correspondences:
-    """The matches with x0 from its middle, scaled."""
     x0 = (c.x0 - middle[:, None]) * scale[:, None, None]
     if (lafs := c.lafs0) is not None:
         shift = torch.nn.functional.pad(middle[:, None, :, None], (2, 0))  # of centres alone

@@ -44,7 +44,6 @@ class CalibratedLenses:
             raise ValueError(self.problems[0])
 
     def _calibration(self, k: int, K: Any) -> Any:
-        """K of an image, for all pairs or each of them."""
         lenses = [pair[k] for pair in self.pairs]
         known = [lens.K for lens in lenses if lens is not None]
         if not known:

@@ -20,7 +20,6 @@ def write_image(path: Path, seed: int = 0, size: tuple[int, int] = SIZE) -> Path
 
 
 def turned(angle: float) -> np.ndarray:
-    """A rotation about the y axis."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
 

@@ -216,7 +216,6 @@ def line(number: int, change: Callable[[str], str]) -> Edit:
 
 
 def word(number: int, value: str) -> Edit:
-    """Another first word in a line."""
     return line(number, lambda text: " ".join([value, *text.split()[1:]]))
 
 

@@ -33,7 +33,6 @@ OPTIONS = {
 
 
 def searched(pair: Pair) -> np.ndarray:
-    """The best models of a short search."""
     return Ransac(hypotheses=100, round=50, pool=4).search(pair).models
 
 
@@ -290,7 +289,6 @@ def test_a_better_degenerate_model_is_completed_and_others_are_left_alone() -> N
 
 
 def errors(**options: object) -> np.ndarray:
-    """NSGD of many pairs."""
     estimate = Ransac(**{**OPTIONS, **options})(collate([scene(i)[0] for i in range(PAIRS)]))  # type: ignore[arg-type]
     truth, size = torch.from_numpy(np.stack([scene(i)[1] for i in range(PAIRS)])), torch.tensor([SIZE]).expand(PAIRS, 2)
     return nsgd(truth, estimate.F, size, size).numpy()

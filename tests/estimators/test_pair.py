@@ -238,7 +238,6 @@ UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("
 
 
 def attached_estimator(name: str) -> estimators.Ransac | estimators.IterativelyReweighted:
-    """One whose fits converge."""
     if name.startswith("irls "):
         return estimators.IterativelyReweighted(loss=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
     return estimators.Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
@@ -254,7 +253,6 @@ def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
 
 @pytest.fixture
 def converging(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Final fits that go on to the optimum."""
     schedule = estimators.refinement.SCHEDULE._replace(iterations=30, tolerance=0.0)
     for name, value in {"SCHEDULE": schedule, "FOCAL_ITERATIONS": 30, "FOCAL_TOLERANCE": 0.0}.items():
         monkeypatch.setattr(estimators.refinement, name, value)

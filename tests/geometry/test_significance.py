@@ -19,7 +19,6 @@ SIZE = (800, 1000)
 
 @pytest.fixture(params=["on", "off"])
 def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By kernels, and by tensors."""
     monkeypatch.setenv(kernel.SWITCH, request.param)
 
 

@@ -101,7 +101,6 @@ def test_the_test_split_of_the_tutorial_has_no_cameras(tmp_path: Path) -> None:
 
 
 def black(size: tuple[int, int]) -> bytes:
-    """A PNG."""
     return cv2.imencode(".png", np.zeros(size, np.uint8))[1].tobytes()
 
 

@@ -10,7 +10,6 @@ Vectors = Sequence[Sequence[float]]
 
 
 def angle(a: Vector, b: Vector) -> float:
-    """Between two directions, in degrees."""
     cosine = dot(a, b) / math.sqrt(dot(a, a) * dot(b, b))
     return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 

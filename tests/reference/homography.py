@@ -74,7 +74,6 @@ def robust_sum(h: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.nda
 
 
 def gradient(f: Callable[[np.ndarray], complex], h: np.ndarray) -> np.ndarray:
-    """The derivative (9,) of a function of h."""
     return np.array([np.imag(f(h + 1j * STEP * v)) / STEP for v in np.eye(9)])
 
 
@@ -91,7 +90,6 @@ def gauss_newton(h: np.ndarray, points: np.ndarray, weight: np.ndarray) -> np.nd
 
 
 def mapped(h: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Points (n, 2) under H."""
     y = homogeneous(x) @ h.reshape(3, 3).T
     return np.asarray(y[:, :2] / y[:, 2:])
 

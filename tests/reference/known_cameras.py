@@ -81,7 +81,6 @@ def best_pose(s: Scene, weight: np.ndarray, cameras: Cameras = (K0, K1)) -> tupl
 
 
 def angle(R: np.ndarray, S: np.ndarray) -> float:
-    """Between two rotations, degrees."""
     return float(np.degrees(np.linalg.norm(Rotation.from_matrix(R @ S.T).as_rotvec())))
 
 

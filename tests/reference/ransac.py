@@ -16,12 +16,10 @@ CAPACITY_UNIT = 2.0**-16  # capacities are rounded to multiples of it, because t
 
 
 def inlier(r: float) -> float:
-    """The gain of RANSAC."""
     return 1.0 if r <= 1 else 0.0
 
 
 def truncated_square(r: float) -> float:
-    """The gain of MSAC."""
     return 1 - r * r if r < 1 else 0.0
 
 
@@ -38,7 +36,6 @@ def magsac(r: float) -> float:
 
 
 def rounded(value: float, bits: int) -> float:
-    """The nearest multiple of 2^-bits."""
     return round(value * 2**bits) / 2**bits
 
 
@@ -58,7 +55,6 @@ def saturated(gains: Sequence[float], weights: Sequence[float], cells: np.ndarra
 
 
 def lower_median(values: Sequence[float]) -> float:
-    """The lower of the middle values."""
     return sorted(values)[(len(values) + 1) // 2 - 1]
 
 

@@ -10,7 +10,6 @@ Array = np.ndarray
 
 
 def cast(geometry: Geometry, pieces: Pieces, near: np.float32, met: Met) -> None:
-    """`raycast_kernels.cast_pieces`."""
     h, w = met.piece.shape
     x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -67,7 +66,6 @@ def colour(texture: Texture, u: np.ndarray, v: np.ndarray, lod: np.ndarray) -> n
 
 
 def shade(stage: Stage, hits: Met, inverse: Matrix, offset: tuple[float, float], out: np.ndarray) -> None:
-    """`Stage._shade`."""
     index = np.flatnonzero(hits.piece.ravel() >= 0)
     piece = hits.piece.ravel()[index]
     order = np.argsort(stage.geometry.texture[piece], kind="stable")

@@ -20,7 +20,6 @@ def hartley(x: Array, w: Array | None = None) -> Array:
 
 
 def skew(e: Array) -> Array:
-    """``[e]_x``."""
     return np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
 
 
@@ -101,7 +100,6 @@ def fundamental_from_projections(P0: np.ndarray, P1: np.ndarray) -> np.ndarray:
 
 
 def line(F: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The epipolar line of x with unit normal."""
     a, b, c = F @ np.array([x[0], x[1], 1.0])
     return np.array([a, b, c]) / np.hypot(a, b)
 

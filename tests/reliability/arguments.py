@@ -91,7 +91,6 @@ def given(array: np.ndarray, kind: str) -> Any:
 
 
 def _with(value: Any, wrong: float) -> Any:
-    """The value with one element of it replaced."""
     array = np.array(value, dtype=np.float64)
     if array.size:
         array.reshape(-1)[array.size // 2] = wrong
@@ -145,5 +144,4 @@ def scenes(shapes: Sequence[tuple[int, ...]] = ((), (), (1,), (2,), (3, 2), (0,)
 
 
 def batches() -> st.SearchStrategy[Scene]:
-    """The same with one leading dimension."""
     return scenes([(1,), (1,), (2,), (3,), (0,)])

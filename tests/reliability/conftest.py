@@ -43,13 +43,11 @@ def starter() -> Starter:
 
 @pytest.fixture(scope="package")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set of nine pairs."""
     return draw_set(tmp_path_factory.mktemp("data") / "Set", ["scene0"], images=10)
 
 
 @pytest.fixture(scope="package")
 def truth(starter: Starter, root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
-    """The rows of an evaluation that nothing disturbs."""
     folder = tmp_path_factory.mktemp("undisturbed")
     done = starter.run(folder, "eval", *evaluation(root, folder / "run"))
     assert done.status == 0, done.said()

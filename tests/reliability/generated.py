@@ -116,12 +116,10 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
 
 
 def _alike(shape: tuple[int, ...], F: Tensor | None, residual: Tensor | None) -> Tensor:
-    """Equal weights for all matches."""
     return torch.ones(shape)
 
 
 def tensors(result: Any) -> Iterator[Tensor]:
-    """The tensors of a result, at any depth."""
     if isinstance(result, Tensor):
         yield result
     elif isinstance(result, tuple | list):
@@ -144,7 +142,6 @@ def sound_result(name: str, clean: bool, result: Any) -> None:
 
 
 def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
-    """Some fields of a batch of correspondences."""
     values = {}
     sizes = data.draw(st.booleans(), label="sizes are given")
     for name, (numbers, shape) in FIELDS.items():
@@ -211,7 +208,6 @@ def sound_pose(R: Tensor, t: Tensor, E: Tensor) -> None:
 
 
 def pruned(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
-    """A pruner's preset on correspondences."""
     scene = data.draw(batches(), label="scene")
     kind = data.draw(st.sampled_from(KINDS[:2]), label="kind")
     arguments = fields(data, scene, kind)
@@ -281,7 +277,6 @@ def pipeline(name: str) -> Any:
 
 
 def photographs(data: st.DataObject) -> tuple[Call, set[str], Check]:
-    """fmtorch.match on arrays."""
     kinds, seeds = st.sampled_from(list(images(0))), st.integers(0, 3)
     two = [images(data.draw(seeds))[data.draw(kinds, label="image")] for _ in range(2)]
     word = data.draw(st.sampled_from(["sift_gms", "sift_fmtorch"]), label="pipeline")
@@ -303,7 +298,6 @@ def installed_estimators() -> list[str]:
 
 
 def subjects() -> dict[str, Draw]:
-    """All that is called, by name."""
     draws: dict[str, Draw] = {}
     for module in (geometry, metrics, pruning, matching):
         public = {name: getattr(module, name) for name in module.__all__}

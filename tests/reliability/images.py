@@ -38,7 +38,6 @@ def png(width: int, height: int, rows: bytes, colour: int = 0, depth: int = 8, p
 
 
 def jpeg_of_size(width: int, height: int) -> bytes:
-    """A small JPEG whose header says another size."""
     data = bytearray(saved(SOFT, "JPEG"))
     at = data.index(b"\xff\xc0")
     data[at + 5 : at + 9] = struct.pack(">HH", height, width)

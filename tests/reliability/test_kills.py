@@ -153,7 +153,6 @@ def test_two_photographs_are_matched_again(kills: int, starter: Starter, root: P
 
 
 def trained(folder: Path) -> dict[str, bytes]:
-    """The weights and figures of a training."""
     return {name: (folder / name).read_bytes() for name in ("lc.safetensors", "validation.json")}
 
 

@@ -102,7 +102,6 @@ def archive(path: Path, members: dict[str, bytes], link: str | None = None) -> b
 
 @pytest.fixture
 def ranges(server: tuple[type[Ranges], str], tmp_path: Path) -> tuple[type[Ranges], str]:
-    """The same of a sequence of 50 kB."""
     noise = random.Random(0).randbytes(50_000)
     content = archive(tmp_path / "source.tgz", {"rgbd_dataset_x/rgb.txt": b"# list", "rgbd_dataset_x/rgb/1.png": noise})
     handler, address = server

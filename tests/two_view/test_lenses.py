@@ -56,6 +56,25 @@ def surroundings(seed: int, nearest: float, farthest: float, flat: bool = False)
     return x0, np.r_[rng.permutation(x1[:60]), x1[60:]], R, t
 
 
+def test_covariances_of_matches_alone_in_lists_and_behind_lenses() -> None:
+    x0, x1 = photographs(PINHOLE, PINHOLE)
+    C = np.diag([0.3, 2.0]) * np.random.default_rng(0).uniform(0.5, 2, (len(x0), 1, 1))
+    alone, part = (FUNDAMENTAL(x0[:n], x1[:n], noise=C[:n], **SIZES) for n in (None, 90))
+    listed = FUNDAMENTAL([x0, x0[:90]], [x1, x1[:90]], noise=[C, torch.from_numpy(C[:90])], **SIZES)
+    assert torch.equal(listed.F, torch.cat([alone.F, part.F]))
+    assert not torch.equal(alone.F, FUNDAMENTAL(x0, x1, noise=np.full(len(x0), 0.77), **SIZES).F)
+    bent = Lens(512.0, 512.0, 319.5, 239.5, "SIMPLE_RADIAL", (1e-12,))  # which is there, and bends nothing
+    behind = fmtorch.find_essential(x0, x1, noise=C, lens=bent)
+    assert_close(behind.F, fmtorch.find_essential(x0, x1, bent.K, bent.K, noise=C).F, rtol=0, atol=1e-7)
+    assert bool(HOMOGRAPHY(x0, x1, noise=C).ok.all())
+    for wrong, options, said in (
+        (-C, {}, "noise of match 0 of pair 0 is nan; it is a standard deviation, positive, or a covariance"),
+        (C, {"lens": "shared"}, "needs a lens that is calibrated, not shared"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            FUNDAMENTAL(x0, x1, noise=wrong, **SIZES, **options)
+
+
 @pytest.mark.parametrize(("nearest", "farthest"), [(0, 75), (0, 100), (80, 100), (95, 120)])
 def test_rays_beyond_90_degrees(nearest: float, farthest: float) -> None:
     """In front or behind: the rotation and the direction, with its sign, of nine scenes of ten, and most inliers."""

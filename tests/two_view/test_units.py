@@ -175,7 +175,6 @@ def test_significance_is_that_of_its_definition() -> None:
 
 
 def normalized(x: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Points by their calibration matrix."""
     return mapped(np.linalg.inv(K), x)
 
 

@@ -102,7 +102,6 @@ def matches(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def read(path: Path) -> dict[tuple[int, int], Any]:
-    """The two-view geometries of a database, of failures too."""
     with pycolmap.Database.open(path) as database:
         ids, _ = database.read_num_matches()
         pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in ids]
@@ -110,7 +109,6 @@ def read(path: Path) -> dict[tuple[int, int], Any]:
 
 
 def plain(geometries: dict[tuple[int, int], Any]) -> dict[tuple[int, int], tuple[Any, ...]]:
-    """The same in values that can be compared."""
     values = {}
     for pair, g in geometries.items():
         matrices = (g.E, g.F, g.H, None if g.cam2_from_cam1 is None else g.cam2_from_cam1.matrix())

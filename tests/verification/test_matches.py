@@ -288,7 +288,6 @@ def write(folder: Path, cameras: Scene) -> list[tuple[str, str]]:
 
 
 def hloc(folder: Path) -> dict[str, Path]:
-    """The arguments for what `write` has written."""
     return {argument: folder / file for argument, file in HLOC.items()}
 
 

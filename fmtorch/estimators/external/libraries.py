@@ -375,7 +375,6 @@ def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement:
 
 
 def _centre(size: tuple[int, int]) -> NDArray[np.float64]:
-    """The middle (x, y) of an image of a size (h, w), in pixels."""
     return (np.array(size[::-1], np.float64) - 1) / 2
 
 

@@ -78,7 +78,6 @@ def with_prior(c: Correspondences, seed: int = 0) -> Correspondences:
 
 
 def error(F: torch.Tensor, pair: Photographs) -> float:
-    """NSGD of the estimate (1, 3, 3)."""
     return float(nsgd(torch.from_numpy(pair.F)[None], F, pair.c.size0, pair.c.size1, key=pair.c.keys))
 
 
@@ -257,7 +256,6 @@ def test_rounds_end_when_enough_of_them_confirm_the_best(min_rounds, confirmatio
 
 
 def searching(iterations: int = 12, **options: int) -> FocalSearch:
-    """A search that only selects."""
     focal = Focal(iterations=iterations, samples=0, **options)
     return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
 

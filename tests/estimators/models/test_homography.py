@@ -27,7 +27,6 @@ class Matches(NamedTuple):
 
 
 def matches(seed: int, count: int = 200, noise: float = 0.5, wrong: float = 0.5, truth: np.ndarray = TRUTH) -> Matches:
-    """Noise in px of every coordinate."""
     rng = np.random.default_rng(seed)
     x0 = rng.uniform(0, [W, H], (count, 2))
     x1 = reference.mapped(truth.ravel(), x0)
@@ -39,7 +38,6 @@ def matches(seed: int, count: int = 200, noise: float = 0.5, wrong: float = 0.5,
 
 
 def corner_error(estimated: torch.Tensor, truth: np.ndarray = TRUTH) -> float:
-    """The mean distance of the corners in px."""
     apart = reference.mapped(estimated.detach().numpy(), CORNERS) - reference.mapped(truth.ravel(), CORNERS)
     return float(np.linalg.norm(apart, axis=1).mean())
 
