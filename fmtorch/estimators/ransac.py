@@ -22,7 +22,7 @@ from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
 from fmtorch.estimators.models import focal_prior, fundamental, posterior, with_focals
 from fmtorch.estimators.models.fundamental import EightPoint, FitScale, Homography, Matrices, SevenPoint
-from fmtorch.estimators.pair import MATCH_WEIGHT, Lens, Pair, across_lines, normalize_pair, to_pixels
+from fmtorch.estimators.pair import Lens, Pair, across_lines, normalize_pair, to_pixels
 from fmtorch.estimators.preselection import Count, Preselect, Preselection
 from fmtorch.estimators.refinement import Adaptive, Fit, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.search import Degensac, Search, merge
@@ -259,11 +259,9 @@ class Ransac:
         return estimation.estimates(Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
-        """Search to fit of one pair."""
+        """Search to fit of one pair, which is the search's own."""
         if self.focal is not None and self.focal.options.sqrt_prior and pair.sizes_known:
-            table = pair.table.copy()
-            np.sqrt(pair.match_weight, out=table[MATCH_WEIGHT])
-            pair = pair.with_table(table, pair.known, pair.lens)
+            np.sqrt(pair.match_weight, out=pair.match_weight)
         if pair.lens is not None:
             return self._with_lenses(pair, pair.lens)
         solution = self._of_pinholes(pair)
