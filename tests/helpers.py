@@ -80,7 +80,6 @@ def full_disk(*_: object, **__: object) -> Any:
 
 
 def apart(F: np.ndarray, G: np.ndarray) -> float:
-    """The largest difference of two matrices of unknown sign."""
     return float(min(np.abs(F - G).max(), np.abs(F + G).max()))
 
 
@@ -94,7 +93,6 @@ def same(a: Any, b: Any) -> bool:
 
 
 def cross_matrix(t: np.ndarray) -> np.ndarray:
-    """[t]x, whose product with x is t x x."""
     x, y, z = t
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
@@ -123,7 +121,6 @@ def in_threads(count: int, work: Callable[[int], object]) -> None:
 
 
 def call_command(monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str) -> None:
-    """``fmtorch <words>`` in a folder, within this process."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["fmtorch", *words])
     monkeypatch.setattr(sys, "path", [str(folder), *sys.path])

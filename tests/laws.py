@@ -165,7 +165,6 @@ def live_values(result: Result, c: Correspondences) -> Result:
 
 @functools.cache
 def degenerate() -> dict[str, Correspondences]:
-    """Pairs that no estimator can solve, or only by luck."""
     good = scene(3)
     ratio = good.ratio
     assert ratio is not None

@@ -66,7 +66,6 @@ class Command:
         return self.kill()
 
     def said(self) -> str:
-        """All that it wrote to the terminal."""
         return self.log.read_text(errors="replace")
 
 
@@ -82,7 +81,6 @@ class Starter:
         self._count = 0
 
     def ask(self, job: dict[str, Any]) -> int:
-        """The answer to one line."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(job) + "\n")

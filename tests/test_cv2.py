@@ -33,7 +33,6 @@ def expect_same_kind(theirs: tuple[Any, ...], ours: tuple[Any, ...]) -> None:
 
 
 def homography_points(wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of a plane, seen twice, and the map."""
     rng = np.random.default_rng(5)
     H = np.array([[0.9, -0.1, 40], [0.08, 0.95, -10], [1e-4, -5e-5, 1]])
     x = rng.uniform([0, 0], SIZE[::-1], (120, 2))

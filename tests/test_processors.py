@@ -59,7 +59,6 @@ def inputs() -> dict[str, Any]:
 
 
 def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
-    """What is promised to have the same bits."""
     tables = {"quantiles of focal lengths": normal_quantiles(), "table of MAGSAC++": LOSS_TABLE}
     arrays = {name: torch.from_numpy(table) for name, table in tables.items()}
     for what, c in given["pairs"].items():

@@ -39,7 +39,6 @@ def loaded(group: str, word: str) -> dict[str, Any]:
 
 
 def keywords(word: str) -> dict[str, Any]:
-    """An estimator as keywords of `find_fundamental`."""
     name, _, rest = word.partition(":")
     return {"estimator": name, **options(rest)}
 

@@ -6,9 +6,11 @@ import json
 import os
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from omegaconf import DictConfig
@@ -19,7 +21,7 @@ from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.commands.report import by_dataset, named
 from fmtorch.core.files import write_whole
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
-from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data import ImagePair, ImageSource, PairDataset
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.run import evaluate_pairs, informed, run_identity, select
 from fmtorch.evaluation.statistics import ALL, Group, summarize
@@ -31,6 +33,7 @@ from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs import CachedFeatures, RunFolder, identity_digest
 from fmtorch.two_view.arguments import expect_lens, expect_lenses
 
+NO_TRUTH = "its true F, or H, must be a finite 3 x 3 matrix that is not zero"
 SWEPT = "FMTORCH_SWEPT"  # names the file in which the jobs of a sweep note their run folders and pairs
 
 
@@ -55,11 +58,11 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         if fields.lens is not None:
             expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
-        known = fields.cameras, fields.pose.signed, fields.lens
+        every, known = _pairs_of(dataset), (fields.cameras, fields.pose.signed, fields.lens)
         identity = run_identity(config, pipeline_name, pipeline, dataset.digest, *known)
         name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
-        pairs = select(_pairs_of(dataset), fields.limit)
+        pairs = select(every, fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
         todo = _missing(own, folder, journal, again=bool(fields.debug))
@@ -96,12 +99,25 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 
 def _pairs_of(dataset: PairDataset) -> list[ImagePair]:
-    """All pairs of a data set, which may be anybody's. Raises ValueError where one is something else."""
+    """All pairs of a data set, which may be anybody's. Raises ValueError where one is something else, or twice."""
+    kind = type(dataset).__name__
+    if lacking := [part for part in ("name", "digest", "__len__", "__getitem__") if not hasattr(dataset, part)]:
+        raise ValueError(f"{kind} is no data set: it has no {', '.join(lacking)}")
     pairs = [dataset[i] for i in range(len(dataset))]
-    if wrong := [i for i, pair in enumerate(pairs) if not isinstance(pair, ImagePair)]:
-        kind = type(pairs[wrong[0]]).__name__
-        raise ValueError(f"{type(dataset).__name__}[{wrong[0]}] is a {kind}; the pairs of a data set are ImagePair")
-    return pairs
+    for i, pair in enumerate(pairs):
+        if not isinstance(pair, ImagePair):
+            raise ValueError(f"{kind}[{i}] is a {type(pair).__name__}; the pairs of a data set are ImagePair")
+        if not isinstance(pair.image0, ImageSource):
+            raise ValueError(f"{kind}[{i}]: image0 is a {type(pair.image0).__name__}; images are ImageSource")
+    twice = [name for name, count in Counter(pair.identity for pair in pairs).items() if count > 1]
+    if twice or not pairs:
+        raise ValueError(f"{kind} has two pairs of the identity {twice[0]!r}" if twice else f"{kind} has no pairs")
+    return [p if p.problem or _has_truth(p) else dataclasses.replace(p, problem=NO_TRUTH) for p in pairs]
+
+
+def _has_truth(pair: ImagePair) -> bool:
+    true = pair.F if pair.H is None else pair.H
+    return np.shape(true) == (3, 3) and bool(np.isfinite(true).all() and np.any(true))
 
 
 def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None, again: bool) -> list[ImagePair]:

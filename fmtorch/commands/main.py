@@ -57,7 +57,11 @@ def main(words: Sequence[str] | None = None) -> None:
         sys.argv[1:] = rest
         if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
             sys.path.insert(0, os.getcwd())
-        _command(name)()
+        try:
+            _command(name)()
+        except KeyboardInterrupt:  # while it is imported
+            print("interrupted", file=sys.stderr)
+            sys.exit(130)
 
 
 def _command(name: str) -> Callable[[], None]:

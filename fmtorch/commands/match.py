@@ -77,8 +77,12 @@ def match_folder(
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")
             pairs = folders.similar_pairs(images, folders.vectors_of(seen, vector), similar)
-        for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
-            pass
+        try:
+            for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
+                pass
+        except KeyboardInterrupt:
+            kept = f"{work.done + work.taken} of {len(pairs)} pairs are kept in {output}"
+            raise KeyboardInterrupt(f"{kept}; the same command continues") from None
     shutil.rmtree(scratch, ignore_errors=True)
     _expect_some(work, len(pairs))
     graph = export.view_graph(journal, images, pairs)
@@ -87,13 +91,7 @@ def match_folder(
     written += [*export.write_view_graph(graph, output), _draw_graph(graph, folder, fields.orient, output)]
     _say(work, graph, len(pairs))
     console.print(f"{output}: {', '.join(written)}", style="dim")
-    exported = images if "colmap" in kinds and fields.orient else ()
-    if turned := files.head([f.relative_to(folder).as_posix() for f in exported if stored_orientation(f) != 1]):
-        console.print(
-            f"turned by their orientation tags: {turned}. Keypoints and cameras in database.db are those of the turned "
-            "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
-            "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
-        )
+    _say_turned(folder, images if "colmap" in kinds and fields.orient else ())
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim")
     return output
@@ -117,6 +115,15 @@ def _say(work: FolderMatches, graph: export.ViewGraph, pairs: int) -> None:
     if sizes:
         others = f"; {apart} image{'s are' if apart > 1 else ' is'} in no related pair" if apart else ""
         console.print(f"connected images: {', '.join(map(str, sizes))}{others}")
+
+
+def _say_turned(folder: Path, exported: Sequence[Path]) -> None:
+    if turned := files.head([f.relative_to(folder).as_posix() for f in exported if stored_orientation(f) != 1]):
+        console.print(
+            f"turned by their orientation tags: {turned}. Keypoints and cameras in database.db are those of the turned "
+            "images, from which COLMAP's mapper works; but COLMAP reads files as they are stored, so that "
+            "its colours, undistorted images and dense reconstruction will not fit. Turn the files, or use orient=false"
+        )
 
 
 def _draw_graph(graph: export.ViewGraph, folder: Path, orient: bool, output: Path) -> str:
@@ -179,7 +186,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         "longest_side": fields.longest_side, "truth": None if fields.truth is None else str(fields.truth),
         "cameras": cameras.identity.get("cameras"), "lens": fields.lens, "digests": [*map(image_digest, images)],
     }  # fmt: skip
-    folder = fields.output or _default_output(paths, settings)
+    folder = _output(fields.output, paths, settings)
     files.expect_writable(folder)
     pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     options = {"longest_side": fields.longest_side, "seed": fields.seed, "lens": fields.lens, **knowledge}
@@ -231,17 +238,21 @@ def _given(*images: Path | None) -> list[Path]:
     return list(filter(None, images))
 
 
-def _default_output(paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
-    """``matches/NAME0-NAME1``, with some digits behind where that holds other images of these names or settings."""
-    folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
-    with contextlib.suppress(OSError, ValueError, KeyError):
-        earlier = json.loads((folder / "result.json").read_text())
-        images = [str(path.absolute()) for path in paths]
-        same = [str(Path(earlier[name]).absolute()) for name in ("image0", "image1")] == images
-        if not same or any(earlier.get(name) != value for name, value in settings.items()):
-            identity = files.canonical({"images": images, **settings})
-            return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
-    return folder
+def _output(given: Path | None, paths: Sequence[Path], settings: Mapping[str, Any]) -> Path:
+    """The folder that is given, or ``matches/NAME0-NAME1``, with some digits behind where that holds other images of
+    these names or settings. Raises ValueError where the given one does, or is that of a folder."""
+    folder, earlier = given or Path(f"matches/{paths[0].stem}-{paths[1].stem}"), dict[str, Any]()
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        earlier = dict(json.loads((folder / "result.json").read_text()))
+    images = [str(path.absolute()) for path in paths]
+    same = [str(Path(str(earlier.get(name))).absolute()) for name in ("image0", "image1")] == images
+    free = not earlier or (same and all(earlier.get(name) == value for name, value in settings.items()))
+    if free and (given is None or not (given / folders.RECORD).exists()):
+        return folder
+    if given is not None:
+        raise ValueError(f"output={given} holds the matches of other images or settings; choose another, or delete it")
+    identity = files.canonical({"images": images, **settings})
+    return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
 
 
 def _nsgd(result: MatchResult, truth: NDArray[np.float64]) -> float:

@@ -15,6 +15,8 @@ from fmtorch.core.terminal import console
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
     try:
+        from lightning.fabric.utilities.exceptions import MisconfigurationException
+
         from fmtorch.training.run import run
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
@@ -25,7 +27,10 @@ def task(config: DictConfig) -> None:
         console.print(f"no pruner= is given: {name} is trained, the network of Yi et al. (CVPR 2018)")
     if sys.argv[1:2] != ["train"]:
         sys.argv.insert(1, "train")  # Lightning starts its other processes by these words
-    run(config, name)
+    try:
+        run(config, name)
+    except MisconfigurationException as error:
+        raise ValueError(f"{str(error).partition(chr(10))[0]} (trainer=, validation.monitor=)") from error
 
 
 main = functools.partial(run_command, TRAIN, task)

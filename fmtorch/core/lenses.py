@@ -111,8 +111,7 @@ class Model:
 
 
 def radial(u: Matrix, v: Matrix, *k: float) -> tuple[Matrix, Matrix]:
-    """A polynomial in the squared radius with coefficients k; without any, a pinhole, or a fish-eye whose radius is
-    the angle to the axis."""
+    """A polynomial in the squared radius with coefficients k; none of a pinhole, or of an equidistant fish-eye."""
     factor = _polynomial(u * u + v * v, k)
     return u * factor, v * factor
 

@@ -192,9 +192,7 @@ def shown(value: Any) -> str:
     """A value as a command line or a YAML file has it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(shown, value))}]"
-    return str(value)
+    return f"[{', '.join(map(shown, value))}]" if isinstance(value, list | tuple) else str(value)
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -64,8 +64,7 @@ def pair_key(identity: str) -> int:
 class Features(Record):
     """The local features of one image, or of a padded batch of images (a leading dimension on every field).
     lafs: local affine frames (N, 2, 3) in kornia's convention, the last column being the centre in pixels. scores:
-    detector response (N,). descriptors: (N, D). image_size: (h, w). mask: (N,), True for a real feature; all True when
-    not given."""
+    detector response (N,). descriptors: (N, D). image_size: (h, w). mask: (N,), True for real ones; all by default."""
 
     lafs: Float[Tensor, "*batch n 2 3"]
     scores: Float[Tensor, "*batch n"]

@@ -141,8 +141,7 @@ class FocalSearch:
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
         Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
-        they are tried where good models differ, or where some were there before. Where anything is known of the cameras
-        they are tried and taken."""
+        they are tried where good models differ or some were there before, and taken where cameras are known."""
         known = pair.calibration is not None
         best = self.choice.first(free, pair).F if plausible is None else plausible.F[plausible.best]
         score = self.choice.of_pair(best, pair)

@@ -139,8 +139,7 @@ DIRECTION = (0.3819660112501051, 0.7236067977499790, 0.8541019662496845, 0.52786
 
 def degenerate_support(pair: Pair, inliers: Array, minimal: int, rounding: float) -> str:
     """Why the inliers (n,) determine no model; empty where they may. Several at one place in both images count once.
-    minimal: the size of a minimal sample; fewer inliers support a model no more than any other. rounding: how exact a
-    coordinate of 1 is."""
+    minimal: the size of a minimal sample; fewer inliers support a model no more than any other. rounding: relative."""
     largest: float = max(map(abs, pair.centre.tolist()))
     rounding *= largest / pair.pixels_per_unit + 1  # in the unit of the points
     on_line = np.empty(2, np.bool_)

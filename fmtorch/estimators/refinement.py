@@ -173,8 +173,7 @@ FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standa
 
 class LensFit(NamedTuple):
     """Cameras (1, ...), their lenses (2,) and the model (9,), its cost with derivatives by five rotations, two focal
-    lengths and two lenses, the logarithm of its evidence up to a constant, the inverse of the Hessian, and the standard
-    deviations (2,) of the lenses."""
+    lengths and two lenses, log evidence up to a constant, the inverse Hessian, and deviations (2,) of the lenses."""
 
     cameras: Cameras
     lens: Array

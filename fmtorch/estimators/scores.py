@@ -124,7 +124,6 @@ class SummedGains:
         return out
 
     def _matches(self, pair: Pair) -> tuple[Array, Gain]:
-        """The matches in rows, and their gain."""
         gain = Gain(self.CODE or 0, fractional_bits(pair.count), self.table)
         return scored_matches(pair, self.threshold, self.prior_weighted), gain
 
@@ -367,7 +366,6 @@ class Median:
 
 
 def _rows(pair: Pair) -> Array:
-    """The matches in rows, of scale and weight one."""
     rows = scored_matches(pair, 1.0, False)
     rows[4::MATCH] = 1
     return rows

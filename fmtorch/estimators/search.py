@@ -121,8 +121,7 @@ class Degensac:
 
     A sample of seven is H-degenerate when at least five of its matches agree with a homography that is compatible with
     the model; five triplets of the sample give all such homographies. The homography of a degenerate model is fitted to
-    all its matches, and fundamental matrices of it and two matches off the plane join the models of the round.
-    score: of the engine."""
+    all its matches, and fundamental matrices of it and two matches off the plane join the models of the round."""
 
     SAMPLE = 7
     ON_PLANE = 5

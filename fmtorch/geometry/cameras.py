@@ -1,7 +1,6 @@
 """Fundamental matrices from cameras, ``x1^T F x0 = 0``, image 0 first.
 
-Matrices are of any scale and sign, leading dimensions broadcast, and a result is bit-equal whatever stands beside it in
-the batch, as in `epipolar`."""
+Matrices are of any scale and sign, leading dimensions broadcast, and a result is bit-equal in any batch."""
 
 from typing import NamedTuple
 

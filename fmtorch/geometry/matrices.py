@@ -20,8 +20,7 @@ GAP = 1e-6  # eigenvalue gaps of F^T F below this share of its largest eigenvalu
 def nearest_rank2(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The rank-two matrix nearest to F in Frobenius norm, F - F v v^T, v being the last right singular vector.
     Computed in float64, returned in F's type. Differentiable; where the two smallest singular values meet, v and with
-    it the projection jump, and the gradient is held finite by gap / (gap^2 + eps^2) in place of 1 / gap.
-    F must be finite."""
+    it the projection jump, and the gradient has gap / (gap^2 + eps^2) in place of 1 / gap. F must be finite."""
     rows = F.reshape(*F.shape[:-2], 9).movedim(-1, 0).contiguous().to(torch.float64).reshape(3, 3, *F.shape[:-2])
     v = last_right_singular_vector(rows)
     projected = rows - component_sum(rows * v, 1)[:, None] * v
@@ -452,8 +451,7 @@ def invert(A: Array, out: Array) -> bool:
 
 @inner
 def orthogonal_factor(A: Array) -> bool:
-    """The rotation nearest to a positive or negative multiple of A, in place, by Newton's iteration (Higham 1986).
-    False where A is singular."""
+    """The rotation nearest to A or -A, in place, by Newton's iteration (Higham 1986). False where A is singular."""
     C = vector(9)
     for _ in range(POLAR_STEPS):
         cofactors_kernel(A, C)

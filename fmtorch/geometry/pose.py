@@ -37,8 +37,7 @@ class FourPoses(NamedTuple):
 
 def poses_from_fundamental(F: Matrices, K0: Matrices, K1: Matrices) -> FourPoses:
     """The four decompositions of E = K1^T F K0, in no order of merit; matches tell which one is right.
-    Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable. Arguments as
-    of `pose_from_fundamental`."""
+    Hartley and Zisserman, 9.6.2. Float64 inside, F's type outside; differentiable. K: as of `pose_from_fundamental`."""
     R, t, _, valid = _decomposed(F, K0, K1)
     R, t = R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1))
     R = torch.where(valid[..., None, None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))

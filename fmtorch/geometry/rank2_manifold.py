@@ -168,8 +168,7 @@ def steps(
 
 @inner
 def _system(products: Array, F: Array, e0: Array, e1: Array, damping: float, Q: Array) -> None:
-    """The damped normal equations of a model, with the constraint -> Q, (10, 11) in two rows of LANES each, without
-    right side."""
+    """The damped normal equations of a model, with the constraint, no right side -> Q, (10, 11) in rows of LANES."""
     damped_system(products, F, damping, Q)
     for r in range(9):
         normal = e1[r // 3] * e0[r % 3]

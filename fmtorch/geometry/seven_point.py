@@ -35,8 +35,7 @@ def seven_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
 
 @kernel
 def all_seven_point(points: F8x2, sample: I8x2, F: F8x3, valid: B1x2) -> None:
-    """All models of samples (7, s) of points (4, n) -> F (s, 3, 9), of unit norm; which slots hold one -> valid (s, 3).
-    Those without one are zero."""
+    """All models of samples (7, s) of points (4, n) -> F (s, 3, 9), of unit norm or 0; which are models -> valid."""
     X, f, there = matrix(28, LANES), np.empty((3, 9, LANES)), np.empty((3, LANES), np.bool_)
     work = _room()
     for first in range(0, sample.shape[1], LANES):

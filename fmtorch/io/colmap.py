@@ -199,7 +199,8 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
     """An open database. Its images are read when they are needed, and few of them are kept.
     Raises as `expect_database`, ValueError without keypoints or matches, OSError for a full disk or a held database."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, original: Path | None = None) -> None:
+        """original: of which it is a copy, and which errors name."""
         self._pycolmap = imported()
         expect_database(path)
         self._path = path
@@ -213,7 +214,7 @@ class MatchDatabase(contextlib.AbstractContextManager["MatchDatabase"]):
             lacking = "matches; match the images (colmap exhaustive_matcher)"
         if lacking:
             self.close()
-            raise ValueError(f"{path} holds no {lacking} first")
+            raise ValueError(f"{original or path} holds no {lacking} first")
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -204,7 +204,7 @@ def _arrays(path: Path) -> Iterator[ArrayFile]:
         return
     try:
         npz = np.load(path)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise DataError(f"{path}: is not a valid npz file; write it by numpy.savez") from error
     if not isinstance(npz, np.lib.npyio.NpzFile):
         raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")

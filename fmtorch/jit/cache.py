@@ -146,8 +146,7 @@ def _reference(value: Any, reached: list[Function]) -> Any:
 
 def named_by_version(function: Function, version: str) -> Function:
     """The same function by a name that no other one has: numba names machine code by functions' names alone.
-    Two functions that one function made have one name. Machine code of both, kept by two processes, would be taken for
-    the same by a third."""
+    Machine code of two functions of one name, kept by two processes, would be taken for the same by a third."""
     untyped: Any = function
     name = f"{untyped.__qualname__}_{version[:16]}"
     taken = (untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__)

@@ -177,8 +177,7 @@ class Kernel(Generic[P, R]):
 
     def compiled_alone(self, count: str = "") -> Callable[P, R]:
         """The compiled function, not to be called before those that it calls are compiled, too.
-        A message tells where it is compiled now; count: what the message begins with. Raises ImportError where numba
-        cannot be imported."""
+        A message says that it is compiled now; count: what that begins with. Raises ImportError without numba."""
         with _lock:
             if self._compiled is None:
                 self._compiled, self.calls = _compiled(self, count)

@@ -42,8 +42,7 @@ class WorkersLost(ConnectionError):
 class WorkerPool(contextlib.AbstractContextManager["WorkerPool"]):
     """The workers of an `Execution`, started at their first task, and replaced where they broke; a context manager.
     execution: which workers. preload: modules that processes import before they are forked. limit: workers at most.
-    needs_main: whether tasks may be of the caller's main module, which processes then import: a script needs
-    ``if __name__ == "__main__"``."""
+    needs_main: whether tasks may be of the caller's main module, which processes then import."""
 
     def __init__(
         self, execution: Execution, preload: Sequence[str] = (__name__,), limit: int | None = None,

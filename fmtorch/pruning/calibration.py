@@ -52,8 +52,7 @@ def calibrated(evidence: F4x1, ratio: F4x1, mask: B1x1, numbers: F4x1, out: F4x1
 @kernel
 def calibrated_by_score(evidence: F4x1, score: F4x1, mask: B1x1, numbers: F8x1, out: F4x1) -> None:
     """P(inlier) of `Calibration` from evidence and a matcher's score (n,) -> out (n + 1,), zero where masked; the last
-    is 1 where scores are taken for probabilities. numbers: constant and weight of `alone`; constant and tolerance of
-    `with_score`."""
+    is 1 where scores are taken for probabilities. numbers: the two of `alone`; constant, tolerance of `with_score`."""
     n, count, expected, agreed, factor = len(mask), 0, 0.0, 0.0, odds_of(numbers[2])
     alone, scored = np.empty(n), np.empty(n)
     for i in range(n):

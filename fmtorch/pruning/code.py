@@ -108,8 +108,7 @@ def _exponent(z: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Float[T
 def spread_centres(kernel: Float[Tensor, "n n"], count: int) -> Int[Tensor, " m"]:
     """Indices of at most `count` of the points, crowded places first, none near another; the first of equals.
     kernel (i, j): what the Gaussian at j gives at i. Each centre is the point with the largest uncovered support: the
-    sum of its Gaussian over all points, times one minus the largest Gaussian of earlier centres at it. Coherent matches
-    crowd, wrong ones are alone."""
+    sum of its Gaussian over all points, times one minus the largest Gaussian of earlier centres at it."""
     support = kernel.sum(0)
     uncovered = torch.ones_like(support)
     by_centre = kernel.T.contiguous()

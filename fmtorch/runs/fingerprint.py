@@ -56,8 +56,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 def code_digest(module: str) -> str:
     """The digest of an imported module's source and of what it imports from its own code, at any depth.
     Its own code is the package for a module of fmtorch; for anybody else's the folder that its imports start from, and
-    the files beside and below it whether it imports them or not; of installed packages only these. Raises TypeError for
-    a module without a file."""
+    the files beside and below it whether it imports them or not; of installed packages only these."""
     name = getattr(sys.modules[module], "__file__", None)
     if name is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")

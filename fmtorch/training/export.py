@@ -105,10 +105,7 @@ class Validation:
         values = []
         for pair, logit in zip(self.pairs, logits, strict=True):
             c, p = pair.correspondences, torch.sigmoid(logit)
-            if use.threshold is None:
-                c = c.replace(prior=p.to(c.x0.dtype))
-            else:
-                c = c.keep(p >= use.threshold).compact()
+            c = c.replace(prior=p.to(c.x0.dtype)) if use.threshold is None else c.keep(p >= use.threshold).compact()
             estimate = use.estimator(c, self.seed)
             assert c.size0 is not None
             assert c.size1 is not None

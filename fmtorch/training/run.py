@@ -187,8 +187,7 @@ def train(
 
 class _ResumableCheckpoint(ModelCheckpoint):
     """Checkpoints at every so many steps, and at the end of one in which Ctrl-C comes: at a step of validation when
-    that is done, its best figure included. Lightning saves before it validates, and a training that goes on from there
-    would lack that validation."""
+    that is done, its best figure included. Lightning saves before it validates, and would go on without that."""
 
     def __init__(self, *args: Any, validated_every: int, **options: Any) -> None:
         super().__init__(*args, **options)

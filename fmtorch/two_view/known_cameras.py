@@ -73,8 +73,7 @@ class KnownCameras:
 class Images(NamedTuple):
     """What is known of both images of each pair, after their points are mapped to square pixels.
     map: None where the points are as they were. measured: focal lengths, px, and their relative deviations. size:
-    (h, w), None where unknown. unit: pixels as they were in one of the square ones; None as `map`. problems: of K,
-    empty where there is none."""
+    (h, w), None where unknown. unit: pixels as they were in one of the square ones; None as `map`. problems: of K."""
 
     map: Float[Tensor, "b 2 3 3"] | None
     measured: Float[Tensor, "b 2 2"]

@@ -25,7 +25,7 @@ from fmtorch.core.failures import own_traceback
 from fmtorch.core.types import CONTRADICTED, Correspondences, collate, pair_key
 from fmtorch.core.version import __version__
 from fmtorch.io import colmap
-from fmtorch.io.match_file import HlocMatches, MatchFile, expect_suffix
+from fmtorch.io.match_file import SUFFIXES, HlocMatches, MatchFile, expect_suffix
 from fmtorch.io.match_store import MATRICES, Kind, PairGeometry
 from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, WorkerPool
@@ -149,8 +149,7 @@ class Verification:
     path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
     of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many of
     each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
-    again. seconds: of the whole. warnings: what of a camera was not believed, a line each. tracebacks: of an estimator
-    of the user's own."""
+    again. seconds: of the whole. warnings: what of a camera was not believed, a line each. tracebacks: of own parts."""
 
     path: Path
     pairs: int
@@ -250,8 +249,7 @@ class VerificationRun:
         self.tracebacks: dict[str, None] = {}
 
     def each_batch(self, source: Source[stages.Estimator], report: Callable[[int, int], None]) -> None:
-        """Estimate and keep the pairs that are not done, batch by batch."""
-        todo = self.todo
+        todo, done = self.todo, 0
         if todo:
             report(0, len(todo))
 
@@ -259,7 +257,6 @@ class VerificationRun:
             self._keep(batch, ([], [(ids, reason) for ids in batch.ids]))
 
         batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
-        done = 0
         with WorkerPool(self.mode.execution, PRELOADED) as pool:
             runner = TaskRunner(pool, source, estimate_batch, self._keep, given_up, divided)
             for batch in runner.each(batches):
@@ -271,7 +268,6 @@ class VerificationRun:
         self.store.write(self._counted(self.parts.read()))
 
     def result(self, path: Path, seconds: float) -> Verification:
-        """The summary."""
         kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
         texts = tuple(self.warnings), tuple(self.tracebacks)
         return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds, *texts)
@@ -461,6 +457,8 @@ def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[Pair
     if output is not None:
         if output.exists() and output.samefile(database):
             raise ValueError(f"output={output} is the database itself; leave output out to write into it")
+        if output.suffix in SUFFIXES:
+            raise ValueError(f"output={output} must be a database, such as {output.with_suffix('.db').name}")
         _expect_new(output, force)
     with contextlib.ExitStack() as stack:
         work = database
@@ -469,11 +467,12 @@ def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[Pair
         elif output is not None:
             work = output.with_name(f"{output.name}.partial")
             colmap.remove_database(work)
+            stack.callback(colmap.remove_database, work)
         if work == database:
             colmap.expect_writable(database)
         else:
             colmap.copy_database(database, work)
-        with colmap.MatchDatabase(work) as store:
+        with colmap.MatchDatabase(work, database) as store:
             yield store, output or database
         if whole and output is not None:
             colmap.move_database(work, output)

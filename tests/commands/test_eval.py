@@ -1,5 +1,6 @@
 """`fmtorch eval`: a run folder, continued and refused; failures as rows; errors."""
 
+import dataclasses
 import json
 import re
 import sys
@@ -9,6 +10,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from fmtorch.commands import eval as command_eval
+from fmtorch.data import ImagePair, load
 from tests.helpers import draw_set, edit_lines, write_file
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
@@ -42,6 +45,27 @@ def rows(run_dir: Path) -> list[dict[str, object]]:
 def own(folder: Path, group: str, text: str, name: str = "mine") -> list[str]:
     write_file(folder / "my_conf" / group / f"{name}.yaml", text)
     return ["--config-dir", "my_conf"]
+
+
+class OwnPairs(list[ImagePair]):
+    name, digest = "own", "0"
+
+
+def test_pairs_of_anybodys_data_set_are_checked() -> None:
+    (pair,) = load("stereo")
+    refused: list[tuple[list[ImagePair], str]] = [
+        ([pair, pair], f"OwnPairs has two pairs of the identity '{pair.identity}'"),
+        ([dataclasses.replace(pair, image0="a.png")], "image0 is a str; images are ImageSource"),  # type: ignore[arg-type]
+        ([], "OwnPairs has no pairs"),
+    ]
+    for pairs, said in refused:
+        with pytest.raises(ValueError, match=re.escape(said)):
+            command_eval._pairs_of(OwnPairs(pairs))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="list is no data set: it has no name, digest"):
+        command_eval._pairs_of([pair])  # type: ignore[arg-type]
+    unknown = dataclasses.replace(pair, F=0 * pair.F)
+    (kept,) = command_eval._pairs_of(OwnPairs([unknown]))  # type: ignore[arg-type]
+    assert kept.problem == "its true F, or H, must be a finite 3 x 3 matrix that is not zero"
 
 
 def test_a_run_from_start_to_end(data: list[str], command: RunCommand, tmp_path: Path) -> None:

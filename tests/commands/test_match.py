@@ -215,10 +215,13 @@ def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     result = fmtorch.match(tmp_path / "a.png", tmp_path / "b.webp")
     assert np.array_equal(np.array(report["F"]), result.F.numpy())
 
-    # Without F, into the same folder: a picture, the reason, status 0, and nothing left of the earlier pair.
+    # Without F: a picture, the reason, status 0. The folder of the earlier pair is refused.
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((300, 20), 90, np.uint8))
-    other = ("image1=flat.png", f"output={folder}", "pipeline=sift_gms", "pruner=[ratio]")
-    said = command("match", "image0=a.png", *other, cwd=tmp_path)
+    other = ("image0=a.png", "image1=flat.png", "pipeline=sift_gms", "pruner=[ratio]")
+    said = command("match", *other, f"output={folder}", cwd=tmp_path)
+    assert f"ended: error: output={folder} holds the matches of other images or settings" in said
+    folder = tmp_path / "flat"
+    said = command("match", *other, f"output={folder}", cwd=tmp_path)
     assert "sift_gms pruner=[ratio]: a.png, flat.png" in said
     assert "no keypoints in image1" in said
     assert "ended" not in said
@@ -232,7 +235,8 @@ def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:
     # With F, of photographs that show nothing in common; and of one photograph twice.
     Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
     stages = ("pipeline=sift_ratio", "estimator=lmeds_eight_point", "pruner.ratio.threshold=0.95")
-    said = command("match", "image0=a.png", "image1=other.png", f"output={folder}", *stages, cwd=tmp_path)
+    said = command("match", "image0=a.png", "image1=other.png", "output=other", *stages, cwd=tmp_path)
+    folder = tmp_path / "other"
     assert "probably not the same scene" in said
     assert "nothing in common" not in said  # which is said already
     report = json.loads((folder / "result.json").read_text())
@@ -247,7 +251,11 @@ def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch:
     paths = [Path("x/a.jpg"), Path("x/b.jpg")]
     others = [Path("y/a.jpg"), Path("y/b.jpg")]
     settings = {"pipeline": "sift_gms", "seed": 0, "cameras": None}
-    output, folder = match_command._default_output, Path("matches/a-b")
+    folder = Path("matches/a-b")
+
+    def output(*given: Any) -> Path:
+        return match_command._output(None, *given)
+
     assert output(paths, settings) == folder
     write_file(folder / "result.json", json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg", **settings}))
     assert output(paths, settings) == output([path.absolute() for path in paths], settings) == folder
@@ -315,7 +323,6 @@ def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline_with_camera
 
 
 def photographed(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """What the lens makes of a pinhole's image."""
     h, w = image.shape[:2]
     every = np.stack(np.meshgrid(np.arange(0.0, w + 8, 8), np.arange(0.0, h + 8, 8)), -1)
     at = np.meshgrid(np.arange(w, dtype=np.float32) / 8, np.arange(h, dtype=np.float32) / 8)

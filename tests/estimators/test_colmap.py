@@ -54,7 +54,6 @@ def cameras(m: Matched, known: bool) -> list[Any]:
 
 
 def verified(m: Matched, first: Any, second: Any) -> Any:
-    """COLMAP's geometry of a pair with these cameras."""
     matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
     return pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
 

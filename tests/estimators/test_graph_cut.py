@@ -84,7 +84,6 @@ def test_a_model_is_its_best_fit_as_long_as_the_score_rises() -> None:
 
 @kernel
 def gaussian(F: F8x1, points: F8x2, scale: float, K: F4x1) -> None:
-    """The kernel of residuals."""
     graph_cut._gaussian(F, points, scale, K)
 
 
@@ -195,7 +194,6 @@ def transfers(H: np.ndarray, pair: Pair) -> np.ndarray:
 
 
 def round_of(pair: Pair, count: int = 100) -> tuple[Hypotheses, Verified]:
-    """The verified models of the first samples."""
     search = Ransac(confidence=None).search
     hypotheses = search.family.solve(pair, search.sampler.draw(pair, 0, count, 7), 0)
     return hypotheses, Verified(hypotheses.F, *Preselection(Msac(1.0), None)(hypotheses.F, pair))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
+from fmtorch.core.types import DEVIATION
 from fmtorch.estimators import MAX_NOISE, MIN_NOISE, FitScale, bucket
 from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
@@ -23,7 +24,7 @@ from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 WRONG = {
     "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-    "noise": ((0.0, -1.0, math.nan), "noise of 1 match is wrong: it is a standard deviation, positive"),
+    "noise": ((0.0, -1.0, math.nan), f"noise of 1 match is wrong: {DEVIATION.text}"),
     "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
 }
 HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
@@ -290,7 +291,6 @@ def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
 
 
 def with_noise(c: Correspondences) -> Correspondences:
-    """In float64, with the noise of matches."""
     noise = torch.linspace(0.5, 2, c.mask.shape[1]).double()[None]
     return c.replace(x0=c.x0.double(), x1=c.x1.double(), noise=noise)
 

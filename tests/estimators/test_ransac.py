@@ -236,7 +236,6 @@ def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
 
 @functools.cache
 def names(final: str) -> list[str]:
-    """The presets whose estimate comes from this fit."""
     own = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
     configs = {n: presets.load("estimator", n) for n in own}
     return [n for n, config in configs.items() if config.get("fine", config).get("final") == final]

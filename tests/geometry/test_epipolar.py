@@ -116,7 +116,6 @@ def test_distances_ignore_scale_and_sign(exponent: float, negative: bool, seed: 
 
 
 def random_inputs(*shapes: tuple[int, ...]) -> list[Tensor]:
-    """Numbers of size one, for finite differences."""
     g = torch.Generator().manual_seed(0)
     return [torch.randn(*shape, generator=g, dtype=torch.float64).requires_grad_() for shape in shapes]
 

@@ -162,7 +162,6 @@ def tensors(*arrays: np.ndarray) -> list[Tensor]:
 
 
 def pairs(batch: tuple[int, ...], **options: object) -> list[Tensor]:
-    """R, t, normal, H, K0, K1, x0, x1 of many planes."""
     many = [plane(i, **options) for i in range(int(np.prod(batch, dtype=int)))]  # type: ignore[arg-type]
     R, t, n, H, x0 = (torch.from_numpy(np.stack(a)).reshape(*batch, *a[0].shape) for a in zip(*many, strict=True))
     x1 = homography_points(H, x0)

@@ -165,7 +165,6 @@ def test_what_an_execution_may_be() -> None:
 
 @pytest.fixture
 def threads() -> Iterator[int]:
-    """More threads than one, as torch has by default."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield 2

@@ -51,5 +51,4 @@ def passes(
 
 
 def lpm(x: np.ndarray, y: np.ndarray, *options: Any) -> np.ndarray:
-    """Which matches survive the two passes."""
     return np.isin(np.arange(len(x)), passes(x, y, *options)[0])

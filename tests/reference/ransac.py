@@ -40,7 +40,6 @@ def rounded(value: float, bits: int) -> float:
 
 
 def summed(gains: Sequence[float], weights: Sequence[float], bits: int) -> float:
-    """The sum of rounded gains times weights."""
     return sum(rounded(g * w, bits) for g, w in zip(gains, weights, strict=True))
 
 
@@ -78,7 +77,6 @@ def weighted_sample(weights: Sequence[int], numbers: Sequence[int]) -> list[int]
 
 
 def quantised(prior: Sequence[float], largest: int) -> list[int]:
-    """Priors as whole numbers from 1 to the largest."""
     return [max(round(p * largest), 1) for p in prior]
 
 
@@ -106,7 +104,6 @@ def priority_sample(prior: Sequence[float], numbers: Sequence[int], count: int) 
 
 
 def shuffled(index: Sequence[int], numbers: Sequence[int], count: int) -> list[int]:
-    """The first matches in the order of their numbers."""
     return sorted(index, key=lambda i: numbers[i])[:count]
 
 

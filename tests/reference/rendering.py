@@ -46,7 +46,6 @@ def _solid(geometry: Geometry, i: int, s: np.ndarray, t: np.ndarray, box: tuple[
 
 
 def _fused(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """a + b c, rounded once to float32."""
     return (a + b.astype(np.float64) * c).astype(np.float32)
 
 

@@ -62,7 +62,6 @@ def seven_point(x0: Array, x1: Array) -> list[Array]:
 
 
 def poses(E: Array) -> list[tuple[Array, Array]]:
-    """The four (R, t) of an essential matrix."""
     U, _, Vt = np.linalg.svd(E)
     W = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     rotations = [U @ w @ Vt for w in (W, W.T)]

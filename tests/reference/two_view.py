@@ -38,7 +38,6 @@ class Cameras:
         return self.of(R, self.t + self.basis @ by[3:5], self.focal * np.exp(by[5:]), self.principal)
 
     def fundamental(self) -> np.ndarray:
-        """Of unit Frobenius norm, in pixels."""
         F = self.unscaled()
         return F / np.linalg.norm(F)
 
@@ -105,7 +104,6 @@ def left(c: float) -> float:
 
 
 def noise(r: np.ndarray, w: np.ndarray, truncation: float, parameters: int) -> float:
-    """Consistent noise of residuals within 2.5 of it."""
     s = 0.6 * truncation
     for _ in range(200):
         near = (np.abs(r) < 2.5 * s) & (w > 0)

@@ -86,7 +86,6 @@ def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, 
 
 
 def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
-    """A call of a function by its annotations."""
     parameters = inspect.signature(function).parameters
     wanted = arguments_of(function)
     single = any("b" in want.shape for want in wanted.values())
@@ -152,7 +151,6 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
 
 
 def estimation(name: str, data: st.DataObject) -> tuple[Call, set[str], Check]:
-    """find_fundamental, or find_homography, with a preset."""
     options = merged(keywords(name), few(loaded("estimator", name), 200, 100))
     find = fmtorch.find_homography if name == "homography" else fmtorch.find_fundamental
     scene = data.draw(batches(), label="scene")

@@ -38,7 +38,6 @@ def tiny(root: Path) -> RenderedPairs:
 
 
 def built(family: str, split: str, number: int = 0) -> DrawnScene:
-    """A scene at full scale, not drawn."""
     return known(Task(family, split, number, 0, Plan(1, 6, 1)))
 
 

@@ -98,7 +98,6 @@ def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:
 
 
 def take_reference(patch: pytest.MonkeyPatch) -> None:
-    """NumPy's forms in place of the kernels."""
     geometries = list[Geometry]()
     cast = Geometry.cast
 

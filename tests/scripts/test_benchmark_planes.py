@@ -345,7 +345,6 @@ def direct(method: str) -> list[float]:
 
 
 def called(method: str, x: Any, cameras: Any) -> Any:
-    """F or None, and R and t or None."""
     peer = pytest.importorskip({"poselib": "poselib", "colmap": "pycolmap"}[method.partition(":")[2]])
     if method == "E:poselib":
         pose, _ = peer.estimate_relative_pose(*x, *cameras, {**PROTOCOL, "seed": 0}, {})

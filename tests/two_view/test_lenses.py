@@ -93,7 +93,6 @@ def test_rays_beyond_90_degrees(nearest: float, farthest: float) -> None:
 
 
 def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tuple[Array, Array, Array]:
-    """Undistorted points, and the noise of the matches."""
     ends, noise = [x0, x1], np.ones(len(x0))
     for i, lens in enumerate(lenses):
         if lens is not None:

@@ -109,7 +109,6 @@ def pitch(seed: int, up: bool, count: int = 60, wrong: float = 0.3) -> tuple[np.
 
 
 def error(H: torch.Tensor, truth: np.ndarray, court: np.ndarray, unit: np.ndarray) -> float:
-    """Root mean square of distances in the photograph."""
     apart = mapped(H.numpy() @ unit, court) - mapped(truth, court)
     return float(np.sqrt((apart**2).sum(1).mean()))
 

@@ -210,6 +210,8 @@ def test_a_copy_leaves_the_database_as_it_is(path: Path, tmp_path: Path) -> None
         fmtorch.verify(path, output=copy)
     with pytest.raises(ValueError, match="is the database itself"):
         fmtorch.verify(path, output=path, force=True)
+    with pytest.raises(ValueError, match=r"v\.npz must be a database, such as v\.db"):
+        fmtorch.verify(path, output=tmp_path / "v.npz")
     copy.write_bytes(b"anything")
     assert fmtorch.verify(path, output=copy, force=True).verified == 3
     assert sorted(os.listdir(tmp_path)) == ["database.db", "verified.db"]

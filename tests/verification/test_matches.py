@@ -236,6 +236,7 @@ def test_a_complete_output_is_left_as_it_is(ending: str, command: Callable[..., 
         (["matches=matches.npz"], "matches alone need an output: matches=FILE.npz output=VERIFIED.npz"),
         (["matches=no.npz", "output=v.npz"], "there is no file no.npz; give matches alone: matches=FILE.npz"),
         (["matches=text.npz", "output=v.npz"], "text.npz: is not a valid npz file"),
+        (["matches=empty.npz", "output=v.npz"], "empty.npz: is not a valid npz file"),
         (["matches=array.npz", "output=v.npz"], "array.npz: is a single array; write x0 and x1 by numpy.savez"),
         (["matches=text.h5", "output=v.npz"], "text.h5: is not a valid HDF5 file"),
         (["matches=matches.txt", "output=v.npz"], "matches=matches.txt must end in .npz, .h5, .hdf5"),
@@ -259,8 +260,8 @@ def test_what_are_no_files_to_verify(words: list[str], said: str, command: Calla
     save(tmp_path / "other.npz", {"x0": x0})
     with (tmp_path / "array.npz").open("wb") as file:
         np.save(file, x0)
-    for name in ("text.npz", "text.h5", "matches.txt"):
-        (tmp_path / name).write_text("matches")
+    for name in ("text.npz", "text.h5", "matches.txt", "empty.npz"):
+        (tmp_path / name).write_text("matches" * (name != "empty.npz"))
     end = command("verify", *words, cwd=tmp_path)
     assert end.startswith("ended: error: ")
     assert said in end

@@ -73,8 +73,7 @@ class FundamentalWithFocals:
 
 
 class Subset(NamedTuple):
-    """Matches on which candidates are refined: table (9, n), of `Pair`; parallel: the tolerance of `cheirality`; scale:
-    of the loss, px."""
+    """Matches by which candidates are refined. table: of `Pair`. parallel: of `cheirality`. scale: of the loss, px."""
 
     table: F8x2
     images: Images

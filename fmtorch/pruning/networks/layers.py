@@ -181,10 +181,8 @@ class _ContextBatchNorm(torch.autograd.Function):
     def backward(ctx: Any, dy: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         centred, y, mask, count, weight, r, R, running_mean, varies = ctx.saved_tensors
         n = count.clamp_min(1)
-        if y is not None:
-            g = torch.ops.aten.threshold_backward(dy, y, 0)  # zero in masked slots, since y is
-        else:
-            g = dy.clone() if mask is None else dy * mask
+        # Of y zero in masked slots, since y is.
+        g = torch.ops.aten.threshold_backward(dy, y, 0) if y is not None else dy.clone() if mask is None else dy * mask
         G = g.sum(-1)
         P = (g * centred).sum(-1)
         along = (r * P).sum(1)  # of the derivative by g R, over all matches of the batch

@@ -261,7 +261,6 @@ def searching(iterations: int = 12, **options: int) -> FocalSearch:
 
 
 def free(F: np.ndarray, pair: Pair) -> Candidates:
-    """Models (k, 9) that the other search has found."""
     return Candidates(F, True, pair)
 
 

@@ -30,7 +30,6 @@ FREE = LensPrior(np.zeros(2), np.full(2, 1 / 0.15**2), False)
 
 
 def near(F: np.ndarray, pair: Pair) -> posterior.Cameras:
-    """The cameras near one model (3, 3) of pixels."""
     cameras = posterior.no_cameras(1)
     posterior.nearest_cameras(to_units(F, pair)[None], posterior.images_of(pair), cameras)
     return cameras
@@ -170,7 +169,6 @@ def factors(seed: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray, np.
 
 
 def share(U: Array, V: Array, focal: Array, points: Array, support: Array, tolerance: float) -> float:
-    """Of exact points (4, n), whose gain is one."""
     K0, K1 = (np.diag([1 / f, 1 / f, 1]) for f in focal)
     F, out = (K1 @ U @ np.diag([1, 1, 0]) @ V.T @ K0).reshape(1, 9), np.empty(1)
     cameras = posterior.Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
