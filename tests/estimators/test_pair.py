@@ -11,7 +11,6 @@ from torch import Tensor
 
 from fmtorch import estimators, find_fundamental
 from fmtorch.core import Correspondences, Estimate, collate
-from fmtorch.core.types import DEVIATION
 from fmtorch.estimators import MAX_NOISE, MIN_NOISE, FitScale, bucket
 from fmtorch.estimators.models import with_focals
 from fmtorch.geometry import LOSSES
@@ -24,7 +23,7 @@ from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 WRONG = {
     "prior": ((1.5, -0.1, math.nan), "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-    "noise": ((0.0, -1.0, math.nan), f"noise of 1 match is wrong: {DEVIATION.text}"),
+    "noise": ((0.0, -1.0, math.nan), f"noise of 1 match is wrong: {Correspondences.declared['noise'].bounds.text}"),
     "size0": ((0.0, -3.0, math.nan, math.inf), "size0 is wrong: image sizes (h, w) are positive"),
 }
 HOPELESS = ("empty", "one match", "all points equal", "NaN", "infinite")
