@@ -88,8 +88,11 @@ def run_command(command: Command, task: Task) -> None:
         paths = [*composition.path_fields(command.options), *command.texts]
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
         for name, _, value in (word.partition("=") for word in sys.argv):
-            if (value == "null" or value.startswith("[")) and isinstance(preset := command.groups.get(name), str):
-                raise ValueError(f"{name}={value}; it must be one preset, such as {preset}")
+            if value == "null" or value.startswith("["):
+                if isinstance(preset := command.groups.get(name), str):
+                    raise ValueError(f"{name}={value}; it must be one preset, such as {preset}")
+                if value == "null" and preset is not None:
+                    raise ValueError(f"{name}=null; it must be a list of presets, [] for none")
         if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
             print(SUBMITTED, flush=True)
         if not any(word.startswith("hydra.mode=") for word in sys.argv):

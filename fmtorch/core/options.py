@@ -197,7 +197,7 @@ def shown(value: Any) -> str:
 
 def nearest(name: str, names: Iterable[str]) -> str:
     """The names there are, those most like `name` first; of many only those."""
-    ordered = sorted(names, key=lambda known: -difflib.SequenceMatcher(None, name, known).ratio())
+    ordered = sorted(names, key=lambda known: -difflib.SequenceMatcher(None, str(name), known).ratio())
     more = len(ordered) - MAX_NAMES
     return ", ".join(ordered[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 

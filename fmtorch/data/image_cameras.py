@@ -352,7 +352,7 @@ class ImageCameras:
                 raise DataError(f"{path}: {len(cameras)} cameras and no images.txt beside it that says whose they are")
             self._all = cameras[0]
         else:
-            model = read_model(path if path.is_dir() else path.parent, points=False)
+            model = read_model(path.parent if path.stem == "cameras" and path.is_file() else path, points=False)
             self._named = {image.name: model.cameras[image.camera] for image in model.images}
 
     def of(self, image: Path) -> ImageCamera:

@@ -173,7 +173,6 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
 
 
 def _known(scenes: Sequence[str], *values: Values) -> tuple[NDArray[np.bool_], list[str]]:
-    """Where no value is NaN, and the scenes of these pairs."""
     known: NDArray[np.bool_] = ~np.any([np.isnan(each) for each in values], axis=0)
     return known, [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
 

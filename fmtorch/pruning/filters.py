@@ -173,7 +173,6 @@ def _inside(matches: Matches) -> tuple[Array, Array, Array]:
 
 @inner
 def _ends(p1: Array, side: int) -> Array:
-    """Each match's cell of image 1, (m,)."""
     end = np.empty(len(p1), np.int64)
     for i in range(len(p1)):
         end[i] = np.int64(p1[i, 1] * np.float32(side)) * side + np.int64(p1[i, 0] * np.float32(side))

@@ -40,7 +40,6 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
 
 
 def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
-    """The thing in the middle; returns its height."""
     stone, block = buildings.marble(surfaces, rng), buildings.ashlar(surfaces, rng)
     width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 6.0)
     sides: Literal["same", "twin"] = "twin"
