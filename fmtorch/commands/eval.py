@@ -6,7 +6,6 @@ import json
 import os
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -109,7 +108,8 @@ def _pairs_of(dataset: PairDataset) -> list[ImagePair]:
             raise ValueError(f"{kind}[{i}] is a {type(pair).__name__}; the pairs of a data set are ImagePair")
         if not isinstance(pair.image0, ImageSource):
             raise ValueError(f"{kind}[{i}]: image0 is a {type(pair.image0).__name__}; images are ImageSource")
-    twice = [name for name, count in Counter(pair.identity for pair in pairs).items() if count > 1]
+    ends: dict[str, tuple[ImageSource, ImageSource]] = {}
+    twice = [p.identity for p in pairs if ends.setdefault(p.identity, (p.image0, p.image1)) != (p.image0, p.image1)]
     if twice or not pairs:
         raise ValueError(f"{kind} has two pairs of the identity {twice[0]!r}" if twice else f"{kind} has no pairs")
     return [p if p.problem or _has_truth(p) else dataclasses.replace(p, problem=NO_TRUTH) for p in pairs]

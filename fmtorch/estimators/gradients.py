@@ -70,7 +70,6 @@ class Attached:
         self.final, self.family = final, family
 
     def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
-        """A zero with the gradients of fits."""
         if self.final.gradient == "none":
             return matches.points.new_zeros(len(solved), 9)
         linear = self.final.gradient == "least_squares" and self.family.model == "fundamental"

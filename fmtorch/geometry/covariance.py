@@ -19,7 +19,7 @@ with five corrections:
    up to their noise, nothing is left.
 4. Where neighbours err alike, as in dense matches, so many tell less: see `noise_inflation`.
 5. Where there is little parallax, a wrong match beside its epipolar line has a hundred times as much and would decide
-   the direction of translation alone: matches with `OUTLYING` times the median's tell nothing.
+   the direction of translation alone: matches with `OUTLYING` times what most have tell nothing.
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965)."""
 
@@ -45,7 +45,8 @@ MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estim
 ROTATION_STEPS, ROTATION_SCALE = 6, 9.0  # of the fit of a rotation, and of its loss (Cauchy's), in variances
 CHI_MEDIAN, MEDIAN_DEVIATION = 1.3862943611198906, 1.4426950408889634  # of chi squared of two degrees, ln 4; relative,
 MEDIAN_DEVIATIONS = 4.0  # of the median of n, times sqrt(n)
-OUTLYING = 10.0  # medians of parallax; of right matches so much have those at a tenth of the usual depth
+MOST_STILL = 18.4  # of nine tenths of such distances, four times that of chi squared, as noise may have a long tail
+OUTLYING = 4.0  # times the parallax that nine tenths of the matches do not exceed
 CELLS = 24  # to the longer side of the box of matches, of a grid that tells how neighbours err
 INDEPENDENT = 1.2  # inflation beyond which are 2 to 7 % of fits to 150 to 10,000 matches with independent noise
 TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
@@ -103,10 +104,10 @@ def residual_slopes(
 
 
 def beside_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """How far points (2, b, n) are from where a rotation near R (3, 3, b) turns them, in medians of that (b, n), and
-    whether they are there up to their noise s (b, n): (b,). The rotation is fitted to the matches `near` (b, n),
-    robustly; then half of its squared distances, in units of their variance 2 s^2, are below the median of chi squared
-    of two degrees, ln 4, as far as so many tell it."""
+    """How far points (2, b, n) are from where a rotation near R (3, 3, b) turns them, over that of the ninth tenth (b,
+    n), and whether they are there up to their noise s (b, n): (b,). The rotation is fitted to the matches `near` (b,
+    n), robustly; then half of its squared distances, in units of their variance 2 s^2, are below the median of chi
+    squared of two degrees, ln 4, as far as so many tell it, and nine tenths below `MOST_STILL`."""
     ones, count = torch.ones_like(a0[:1]), near.sum(-1)
     rays = torch.cat([a0 / f[0, :, None], ones])
     target = a1 / f[1, :, None]
@@ -130,11 +131,11 @@ def beside_rotation(a0: Tensor, a1: Tensor, R: Tensor, f: Tensor, s: Tensor, nea
         omega = component_sum(cofactors(A) * b[:, None], 0) / torch.where(determinant_ == 0, 1.0, determinant_)
         turned = turned + cross(omega[..., None].expand_as(turned), turned)
     ordered = torch.where(near, squared, torch.inf).sort(-1).values
-    middle = ((count - 1).clamp_min(0) // 2)[:, None]
-    median = ordered.gather(-1, middle)[:, 0] if ordered.shape[-1] else torch.full_like(f[0], torch.inf)
+    places = (count - 1).clamp_min(0)[:, None] * torch.tensor([5, 9], device=count.device) // 10
+    tenths = ordered.gather(-1, places) if ordered.shape[-1] else torch.full_like(f.T, torch.inf)
     limit = CHI_MEDIAN * (1 + MEDIAN_DEVIATIONS * MEDIAN_DEVIATION / sqrt(count.to(f).clamp_min(1)))
-    parallax = sqrt(squared / median.clamp_min(CHI_MEDIAN)[:, None])
-    return parallax, (count > PINHOLES) & (median < limit)
+    parallax = sqrt(squared / tenths[:, 1:].clamp_min(CHI_MEDIAN))
+    return parallax, (count > PINHOLES) & (tenths[:, 0] < limit) & (tenths[:, 1] < MOST_STILL)
 
 
 def kept_share(c: Tensor) -> Tensor:

@@ -128,7 +128,7 @@ def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences
     points0, points1 = (points[None] if single else points for points in (points0, points1.to(points0.device)))
     kind = torch.promote_types(points0.dtype, points1.dtype)
     known = {name: _field(name, value, single, points0) for name, value in fields.items() if value is not None}
-    if (noise := known.get("noise")) is not None and noise.dim() == 4 - single:
+    if (noise := known.get("noise")) is not None and noise.dim() == 4 - single and noise.shape[-2:] == (2, 2):
         known |= _of_covariances(noise[None] if single else noise)
     mask = known.pop("mask", None)
     mask = torch.ones_like(points0[..., 0], dtype=torch.bool) if mask is None else mask.to(torch.bool)

@@ -54,7 +54,7 @@ class OwnPairs(list[ImagePair]):
 def test_pairs_of_anybodys_data_set_are_checked() -> None:
     (pair,) = load("stereo")
     refused: list[tuple[list[ImagePair], str]] = [
-        ([pair, pair], f"OwnPairs has two pairs of the identity '{pair.identity}'"),
+        ([pair, dataclasses.replace(pair, image0=pair.image1)], f"two pairs of the identity '{pair.identity}'"),
         ([dataclasses.replace(pair, image0="a.png")], "image0 is a str; images are ImageSource"),  # type: ignore[arg-type]
         ([], "OwnPairs has no pairs"),
     ]
