@@ -30,7 +30,7 @@ def task(config: DictConfig) -> None:
     try:
         run(config, name)
     except MisconfigurationException as error:
-        raise ValueError(f"{str(error).partition(chr(10))[0]} (trainer=, validation.monitor=)") from error
+        raise ValueError(f"{str(error).partition(' HINT')[0]} (trainer=, validation.monitor=)") from error
 
 
 main = functools.partial(run_command, TRAIN, task)

@@ -149,7 +149,7 @@ def train(
     after which training ends; None: never. monitor: the figure of validation that chooses the best weights."""
     path, step = latest_checkpoint(folder)
     figure, mode = f"validation/{monitor}", "min" if monitor in SMALLER_IS_BETTER else "max"
-    total = module.optimisation.steps
+    total, every = module.optimisation.steps, min(every, module.optimisation.steps)
     kept = _ResumableCheckpoint(
         folder / CHECKPOINTS, "{step}", save_top_k=1, monitor="step", mode="max", every_n_train_steps=checkpoint_every,
         enable_version_counter=False, save_on_train_epoch_end=False, validated_every=every,

@@ -36,7 +36,6 @@ def words(values: np.ndarray) -> str:
 
 
 def superglue(i: int, j: int, turns: tuple[int, int] = (0, 0)) -> str:
-    """A line of SuperGlue's lists, 38 columns."""
     a, b = cameras()[i], cameras()[j]
     return f"{name(i)} {name(j)} {turns[0]} {turns[1]} {words(a[0])} {words(b[0])} {words(motion(a, b))}"
 

@@ -169,7 +169,6 @@ def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:
 
 
 def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
-    """The thresholds within a preset, times `scale`."""
     levels = {key: scaled(value, scale) for key, value in config.items() if isinstance(value, Mapping)}
     pixels = ("threshold", "inlier_threshold", "scale")
     own = {k: v * scale for k, v in config.items() if k in pixels and isinstance(v, float)}

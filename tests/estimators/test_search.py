@@ -164,7 +164,6 @@ def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None
 
 
 def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
-    """What is said of a pair of these matches."""
     points = [torch.from_numpy(x.astype(dtype).astype(np.float64))[None] for x in (x0, x1)]
     pair = pair_of(Correspondences(*points, torch.ones(1, len(x0), dtype=torch.bool)))
     inside = np.ones(len(x0), np.bool_) if inliers is None else inliers

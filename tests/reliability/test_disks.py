@@ -102,7 +102,6 @@ def test_a_file_in_the_place_of_a_folder_is_named(name, below, starter, root, tm
 
 
 def arguments(name: str, root: Path, output: Path) -> list[str]:
-    """Of a command that writes to a folder."""
     if name == "eval":
         return evaluation(root, output)
     if name == "match":

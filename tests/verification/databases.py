@@ -19,7 +19,6 @@ F = 600.0
 
 
 def parameters(model: str) -> list[float]:
-    """Of a camera of a model."""
     if model == "PINHOLE":
         return [F, 1.02 * F, 310, 250]
     return [*[F] * MODELS[model].focals, 320, 240, *COEFFICIENTS.get(model, ())]

@@ -38,7 +38,6 @@ def off(geometry: Any, cameras: databases.Scene, i: int = 0, j: int = 1) -> tupl
 
 
 def keypoints(path: Path, *images: int) -> list[np.ndarray]:
-    """Homogeneous ones, in COLMAP's pixels."""
     with pycolmap.Database.open(path) as database:
         return [np.c_[database.read_keypoints(i)[:, :2], np.ones(150)] for i in images]
 
