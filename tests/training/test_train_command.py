@@ -255,9 +255,9 @@ def test_a_network_that_cannot_be_trained_is_named(tmp_path: Path) -> None:
 
 
 def test_a_short_training_is_validated_at_its_end(tmp_path: Path) -> None:
-    made = module()
-    assert train(made, tmp_path, every=10 * STEPS, checkpoint_every=3, monitor="log_loss") == STEPS
-    assert loop.load_best(tmp_path, made) == STEPS
+    trained = module()
+    assert train(trained, tmp_path, every=10 * STEPS, checkpoint_every=3, monitor="log_loss") == STEPS
+    assert loop.load_best(tmp_path, trained) == STEPS
 
 
 def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
