@@ -57,10 +57,10 @@ def _ratio(there: Any, here: Any) -> Any:
 
 
 def mean_stretch(J: Any, sqrt: Callable[[Any], Any] = np.sqrt) -> Any:
-    """The same (...) in the mean of all directions, of derivatives J (..., 2, 2, 2): geometric of those in an image,
-    squared of the images. sqrt: of its type."""
-    areas = abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])
-    return sqrt((areas[..., 0] + areas[..., 1]) / 2)
+    """The same (...) in the geometric mean of all directions, of derivatives J (..., 2, 2, 2); where those of image 0
+    are zero, as of exact points, in that of image 1 and none. sqrt: of its type."""
+    a, b = (abs(J[..., k, 0, 0] * J[..., k, 1, 1] - J[..., k, 0, 1] * J[..., k, 1, 0]) for k in (0, 1))
+    return sqrt(sqrt((a + b * (a == 0) / 4) * b))
 
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -115,7 +115,7 @@ def matches_in_sight(c: Correspondences, lenses: Sequence[Lenses]) -> tuple[Corr
     camera; and whether a match is there, for both images.
 
     lenses: of each pair. A match's noise grows as its points are stretched, so that its distances count in pixels of
-    the photographs: by the root of the determinant of the derivatives of its points, in the mean over both
+    the photographs: by the root of the determinant of the derivatives of its points, in the geometric mean over both
     images, until F tells in which direction (`stretch`). Gradients reach the photographs' points."""
     fields, seen = dict[str, Tensor](), np.ones(c.mask.shape, np.bool_)
     behind = np.zeros((*c.mask.shape, 2), np.bool_)
