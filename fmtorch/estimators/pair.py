@@ -142,6 +142,12 @@ class Pair:
         """The same pair with the matches of these indices."""
         return self.with_table(self.table.take(index, 1), self.known, self.lens)
 
+    def ignoring(self, wrong: Array) -> "Pair":
+        """The same pair, matches of which (n,) count nowhere."""
+        table = self.table.copy()
+        table[4, wrong] = table[MATCH_WEIGHT, wrong] = 0
+        return self.with_table(table, (True, *self.known[1:]), self.lens)
+
     def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> "Pair":
         """The same pair with another table."""
         return Pair(

@@ -38,6 +38,7 @@ from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 SEARCHED = 2048  # right matches that suffice for a search
+ACCIDENTAL_SHARE = 0.01  # of wrong matches, which lie beside their epipolar lines
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
@@ -270,7 +271,20 @@ class Ransac:
         return solution._replace(lens_suggested=lens_search.suggested_lens(solution.fit, searched(pair)))
 
     def _of_pinholes(self, pair: Pair) -> Solution:
-        selection, draws = self.selected(searched(pair))
+        """Where cameras are calibrated and all but still, the search is repeated without the matches of outlying
+        parallax, and what it finds is taken if it loses no more of these than may be inliers by accident."""
+        first = self._fitted(pair, *self.selected(searched(pair)))
+        outlying = focal_search.outlying(first.fit, first.inliers, pair)
+        if outlying is None or first.inliers is None:
+            return first
+        second = self._fitted(pair, *self.selected(searched(pair.ignoring(outlying))))
+        if second.inliers is None:
+            return first
+        accidental = 2 + ACCIDENTAL_SHARE * (pair.count - np.count_nonzero(first.inliers))
+        better = np.count_nonzero(outlying & first.inliers & ~second.inliers) <= accidental
+        return (second if better else first)._replace(samples=first.samples + second.samples)
+
+    def _fitted(self, pair: Pair, selection: refinement.Selection, draws: int) -> Solution:
         if not selection.valid:
             return Solution(None, draws, reason=NOT_SOLVED)
         pair = across_lines(pair, selection.F)

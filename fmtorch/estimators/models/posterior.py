@@ -3,6 +3,7 @@
 axes: (k, 2, 3, 3), U and V of ``E = U diag(1, 1, 0) V^T``, rows first. focal: (k, 2), logarithms of focal lengths in
 units of the longer sides. Points are from the principal points."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,6 +104,16 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
     return precision
 
 
+def parallax(cameras: Cameras, pair: Pair) -> Array:
+    """How far points (n,) of image 1 are from where points at infinity would be, in the unit of the points: by that one
+    of the two rotations of an essential matrix, the cameras of one candidate, to which they are nearer."""
+    out = np.empty((2, pair.count))
+    beside_rotations(
+        cameras.axes[0], focals_px(cameras, pair) / pair.pixels_per_unit, images_of(pair).offset, pair.points, out
+    )
+    return min(out, key=np.median)
+
+
 def centred(pair: Pair, scale_px: float = 1.0) -> Weighted:
     """The matches of a pair whose image sizes are known, from the principal points, computed once.
     scale_px: from which on they do not count."""
@@ -113,6 +124,23 @@ def centred(pair: Pair, scale_px: float = 1.0) -> Weighted:
         return Weighted.of(out[:4], pair.weight, out[4])
 
     return pair.cached(("centred", scale_px), compute)
+
+
+@kernel(holds_gil=True)
+def beside_rotations(axes: F8x3, depth: F8x1, offset: F8x1, points: F8x2, out: F8x2) -> None:
+    """How far points (4, n) are from where the two rotations (2, n) turn them, by depths (2,) -> out."""
+    U, V = axes[0], axes[1]
+    for i in range(points.shape[1]):
+        x, y = (points[0, i] + offset[0]) / depth[0], (points[1, i] + offset[1]) / depth[0]
+        a = V[0, 0] * x + V[1, 0] * y + V[2, 0]
+        b = V[0, 1] * x + V[1, 1] * y + V[2, 1]
+        c = V[0, 2] * x + V[1, 2] * y + V[2, 2]
+        for turn in range(2):
+            s = 1.0 - 2.0 * turn
+            z = s * (a * U[2, 1] - b * U[2, 0]) + c * U[2, 2]
+            dx = (s * (a * U[0, 1] - b * U[0, 0]) + c * U[0, 2]) / z * depth[1] - points[2, i] - offset[2]
+            dy = (s * (a * U[1, 1] - b * U[1, 0]) + c * U[1, 2]) / z * depth[1] - points[3, i] - offset[3]
+            out[turn, i] = math.sqrt(dx * dx + dy * dy)
 
 
 @kernel(holds_gil=True)
