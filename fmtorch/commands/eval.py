@@ -51,10 +51,11 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
     if model != "fundamental" and (exports or fields.cameras is not None or fields.lens is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export=, cameras=, lens=: leave them out")
-    expect_lens(fields.lens)
+    if fields.lens != "known":
+        expect_lens(fields.lens)
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
-        if fields.lens is not None:
+        if fields.lens not in (None, "known"):
             expect_lenses(pipeline.estimator, type(pipeline.estimator).__name__)
         dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
         every, known = _pairs_of(dataset), (fields.cameras, fields.pose.signed, fields.lens)
@@ -62,6 +63,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(fields.output or Path(f"runs/{dataset.name}/{name}"), identity)
         pairs = select(every, fields.limit)
+        if fields.lens == "known" and all(image.lens is None for p in pairs for image in (p.image0, p.image1)):
+            raise ValueError("lens=known, but no lens of the data set bends its images: leave it out")
         journal = _journal(folder.path, pairs) if exports else None
         own = pairs if shard is None else shard.of(pairs)
         todo = _missing(own, folder, journal, again=bool(fields.debug))

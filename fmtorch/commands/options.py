@@ -19,6 +19,7 @@ LENS = (
     "how much lenses bend straight lines: shared (one unknown lens), unknown (one of each image), or lambda of the "
     "division model in half diagonals; null: not at all"
 )
+OF_DATA = "known: those of the data set. Images are undistorted with null alone. Part of the run's identity"
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."
 
 
@@ -57,7 +58,7 @@ class EvalOptions:
         "what the estimator is given of each pair's cameras, whose pose is then evaluated; part of the run's identity: "
         "null (nothing, the pose is that of F with the true calibrations) | known | shared | exif | unknown",
     )
-    lens: BentBy = option(None, f"{LENS}. Part of the run's identity")
+    lens: BentBy | Literal["known"] = option(None, f"{LENS}; {OF_DATA}")
     pose: PoseOptions = option(PoseOptions(), "how poses are judged")
     device: Device = option("auto", DEVICE)
     batch: Count = option(16, "pairs that travel together; changes no result")

@@ -55,7 +55,7 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> Pix
         (h, w), (height, width) = image.shape[:2], source.size
         sizes = f"{w} x {h} px, but its camera is of {width} x {height} px"
         raise ImageError(f"{source.path}: {sizes}; it must be the image as it was when its camera was determined")
-    image = image if source.lens is None else undistorted(image, source.lens)
+    image = image if source.lens is None or source.as_photographed else undistorted(image, source.lens)
     return image if source.resampling is None else source.resampling(image)
 
 

@@ -68,7 +68,7 @@ class ImageSource:
     """One image on disk.
     identity: names it within its data set.
     size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
-    lens: whose distortion `read_image` takes out; None for an image without.
+    lens: whose distortion `read_image` takes out, unless it is wanted as_photographed; None for an image without.
     resampling: how `read_image` then resizes and turns it. data: the file's bytes, where a worker cannot read it."""
 
     identity: str
@@ -77,11 +77,17 @@ class ImageSource:
     lens: Lens | None = None
     data: bytes | None = dataclasses.field(default=None, repr=False, compare=False)
     resampling: Resampling | None = None
+    as_photographed: bool = False
+
+    @property
+    def bending(self) -> Lens | None:
+        """The lens that bends the pixels which `read_image` gives, None where none does."""
+        return self.lens if self.as_photographed else None
 
     @property
     def pixels(self) -> tuple[Path, Lens | None, Resampling | None]:
         """What decides the pixels that `read_image` gives."""
-        return self.path, self.lens, self.resampling
+        return self.path, None if self.as_photographed else self.lens, self.resampling
 
 
 class GivenMatches(NamedTuple):

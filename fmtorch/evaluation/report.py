@@ -21,7 +21,7 @@ from fmtorch import data, presets
 from fmtorch.core import files, lazy
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, pair_list, read_image
 from fmtorch.evaluation import curves, statistics, tables
-from fmtorch.evaluation.run import PLACES
+from fmtorch.evaluation.run import PLACES, informed
 from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.pipeline import Outcome, Pipeline, build_pipeline, pictures
@@ -439,7 +439,8 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
         pipeline = pipelines[r.name]
         again: list[Picture] = []
         if pipeline is not None:
-            (outcome,) = pipeline.run([pair], int(r.folder.config.get("seed", 0)))
+            given = informed([pair], r.folder.config.get("cameras"), r.folder.config.get("lens"))
+            (outcome,) = pipeline.run(given, int(r.folder.config.get("seed", 0)))
             note = difference(pair, images, stored, outcome)
             notes += [f"{r.name} {note}"] if note else []
             again = drawn(pair, images, stored, outcome, r.name)

@@ -226,7 +226,7 @@ PLACES = ("root", "file", "truth", "images")  # options that say where a data se
 
 def run_identity(
     config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None,
-    signed: bool = False, lens: Lens = None,
+    signed: bool = False, lens: Lens | Literal["known"] = None,
 ) -> dict[str, Any]:  # fmt: skip
     """The identity of a run, as plain values.
 
@@ -297,12 +297,15 @@ Cameras = Literal["known", "shared", "exif", "unknown"]
 UNKNOWN, EXACT = (1.0, math.inf), (1.0, 0.0)  # px, relative deviation; K stands for the pixels of an exact one
 
 
-def informed(pairs: Sequence[ImagePair], cameras: Cameras | None, lens: Lens = None) -> list[ImagePair]:
+def informed(
+    pairs: Sequence[ImagePair], cameras: Cameras | None, lens: Lens | Literal["known"] = None
+) -> list[ImagePair]:
     """The pairs with what estimators are given of their cameras and lenses.
     cameras: known: their calibrations; exif: the focal lengths in the files of their images, unknown where there are
     none; shared: that both images of a pair are of one camera; unknown: nothing; None: they are not asked for. lens: as
-    of `find_fundamental`. Raises ValueError for `known` where a pair has no calibration."""
-    of_lens, measured = lens_fields(lens), functools.cache(_measured)
+    of `find_fundamental`, or known: the data set's; where it is given, images are read as photographed.
+    Raises ValueError for cameras that are known where a pair has no calibration."""
+    of_lens, measured = {} if lens == "known" else lens_fields(lens), functools.cache(_measured)
 
     def fields(pair: ImagePair) -> dict[str, Tensor | None]:
         if cameras is None:
@@ -319,8 +322,14 @@ def informed(pairs: Sequence[ImagePair], cameras: Cameras | None, lens: Lens = N
         focal, shared = torch.tensor(focals, dtype=torch.float64), torch.tensor(cameras == "shared")
         return {"K0": K[0], "K1": K[1], "focal": focal, "shared_focal": shared, **of_lens}
 
+    def given(pair: ImagePair) -> ImagePair:
+        if lens is not None:
+            image0, image1 = (dataclasses.replace(i, as_photographed=True) for i in (pair.image0, pair.image1))
+            pair = dataclasses.replace(pair, image0=image0, image1=image1)
+        return dataclasses.replace(pair, given=fields(pair))
+
     asked = cameras is not None or lens is not None
-    return [dataclasses.replace(p, given=fields(p)) if asked and p.problem is None else p for p in pairs]
+    return [given(pair) if asked and pair.problem is None else pair for pair in pairs]
 
 
 def _measured(path: Path) -> tuple[float, float]:

@@ -105,7 +105,7 @@ def _stored_image(pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64]
     features, _ = pipeline.features(image)
     h, w = (int(n) for n in features.image_size)
     points, scores = (value.detach().cpu().float().numpy() for value in (features.keypoints, features.scores))
-    return StoredImage(str(image.path), points, scores, (h, w), K)
+    return StoredImage(str(image.path), points, scores, (h, w), None if image.bending else K, image.bending)
 
 
 def _pair(

@@ -26,6 +26,7 @@ from fmtorch.presets.files import available, instantiate, unknown
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
 from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view.lenses import undistorted_matches
 from fmtorch.two_view.pair_type import PairTypes, classify, compile_with
 
 Key = TypeVar("Key")
@@ -85,7 +86,7 @@ class Outcome:
     uses them, cached ones with the seconds they took when they were computed. reason: why the pair failed, empty where
     it did not. pair_type, not_examined: of this pair alone, or why there is none, where it was asked for
     (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints: the correspondences as the matcher
-    left them, where pruners that look at images may have moved their points."""
+    left them, where pruners that look at images, or undistortion, may have moved their points."""
 
     pair: ImagePair
     features: tuple[int, int] = (0, 0)
@@ -288,11 +289,19 @@ class Pipeline:
             values = [None if each is None else each[name] for each in given]
             known = [value.to(c.mask.device) for value in values if value is not None]
             c = c.derived(**{name: torch.stack(known) if known else None})
-        estimate = self.estimated(c, seed)
-        return [
-            dataclasses.replace(outcome, correspondences=c[i], estimate=estimate[i], reason=estimate.reason[i])
-            for i, outcome in enumerate(outcomes)
-        ]
+        images = [(o.pair.image0, o.pair.image1) for o in outcomes]
+        lenses = [(first.bending, second.bending) for first, second in images]
+        bent = any(lens is not None for both in lenses for lens in both)
+        seen = undistorted_matches(c, lenses).derived(lens=None, shared_lens=None) if bent else c
+        estimate, result = self.estimated(seen if c.lens is None else c, seed), []
+        for i, outcome in enumerate(outcomes):
+            keypoints = outcome.keypoints
+            if seen is not c:
+                keypoints = c[i] if keypoints is None else keypoints
+                keypoints = keypoints.derived(mask=seen.mask[i : i + 1, : keypoints.mask.shape[1]])
+            own = dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i], keypoints=keypoints)
+            result.append(dataclasses.replace(own, correspondences=seen[i]))
+        return result
 
     def _alone(self, stage: str, function: Stage, outcome: Outcome) -> Outcome:
         """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
@@ -326,6 +335,7 @@ def _examined(outcomes: Sequence[Outcome], seed: int) -> list[Outcome]:
     try:
         c = collated(outcomes)
         estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
+        estimate = estimate.derived(lens=None) if c.lens is None else estimate  # of matches that are undistorted
         pair_type = classify(c if outcomes[0].pair.given else c.derived(K0=None, K1=None), estimate, seed=seed)
         return [dataclasses.replace(outcome, pair_type=pair_type.of_pair(i)) for i, outcome in enumerate(outcomes)]
     except Exception as error:  # whose fault it is shows pair by pair

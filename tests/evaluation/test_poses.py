@@ -221,7 +221,7 @@ def test_a_calibration_that_is_missing_is_named() -> None:
     assert given(dataclasses.replace(pair, problem="no image"), "known") is None
 
 
-def estimated(outcomes: list[Outcome], cameras: str | None, lens: float | None = None) -> list[Outcome]:
+def estimated(outcomes: list[Outcome], cameras: str | None, lens: float | str | None = None) -> list[Outcome]:
     """The outcomes with the estimates of a batch whose estimator is given the cameras."""
     pairs = evaluation.informed([o.pair for o in outcomes], cameras, lens)  # type: ignore[arg-type]
     keyed = [o.correspondences.replace(key=torch.tensor([o.pair.key])) for o in outcomes]
@@ -265,6 +265,26 @@ def test_a_lens_is_given_to_the_estimator(cameras: str | None) -> None:
     assert row.lens_suggested is None
 
 
+def test_known_lenses_are_judged_in_photographs_and_rows_are_of_undistorted_matches() -> None:
+    straight = outcome(0, noise=0.1)
+    c, calibrations = straight.correspondences, (straight.pair.K0, straight.pair.K1)
+    lenses = [fmtorch.Lens(*K[[0, 1, 0, 1], [0, 1, 2, 2]], "OPENCV", (-0.2, 0.0, 0.0, 0.0)) for K in calibrations]
+    images = (ImageSource("a", Path("a"), lens=lens) for lens in lenses)
+    x0, x1 = (torch.from_numpy(lens.distort(x[0].numpy()))[None] for lens, x in zip(lenses, (c.x0, c.x1), strict=True))
+    c = c.replace(x0=x0, x1=x1, prior=torch.full_like(c.mask, 0.5, dtype=torch.float64))
+    o = without(dataclasses.replace(straight, correspondences=c), image0=next(images), image1=next(images))
+    (known,), (guessed,) = estimated([o], "known", "known"), estimated([o], "known", "shared")
+    given = {name: getattr(c, name) for name in ("prior", "size0", "size1")}
+    alone = fmtorch.find_essential(x0, x1, **given, lens=lenses, key=known.pair.key)
+    assert torch.equal(known.estimate.F, alone.F)
+    assert torch.equal(known.keypoints.x0, x0)
+    for each in (known, guessed):
+        torch.testing.assert_close(each.correspondences.x0, straight.correspondences.x0, atol=1e-6, rtol=0)
+        (row,) = evaluation.evaluate(examined(pipeline(), [each]))
+        assert (row.inlier_rate, row.pair_type) == (1, "general")
+    assert guessed.estimate.lens.max() < -0.05
+
+
 def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path: Path) -> None:
     words = ["eval", "pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
     words += ["limit=1", "workers=1", "features.max_features=2000"]
@@ -288,6 +308,7 @@ def test_a_run_with_cameras_is_another_run(command: Callable[..., str], tmp_path
     assert "ended: error: pose.signed=2; it must be true or false" in command(*words, "pose.signed=2", cwd=tmp_path)
     assert "holds another run" in command(*words, "cameras=shared", "output=known", cwd=tmp_path)
     assert 'lens: (absent) -> "shared"' in command(*words, "lens=shared", "output=without", cwd=tmp_path)
+    assert "ended: error: lens=known, but no lens of the data set bends" in command(*words, "lens=known", cwd=tmp_path)
     assert "ended: error: lens=some" in command(*words, "lens=some", cwd=tmp_path)
     assert "ended: error: cameras=some" in command(*words, "cameras=some", cwd=tmp_path)
 
