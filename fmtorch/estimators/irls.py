@@ -56,16 +56,10 @@ class IterativelyReweighted:
     MIN_MATCHES = 8
 
     def __init__(
-        self,
-        *,
-        loss: str,
-        threshold: float | Mapping[str, float],
-        starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
-        iterations: int = 12,
-        start_scale: float = 0.75,
-        refine_iterations: int = 30,
+        self, *, loss: str, threshold: float | Mapping[str, float], starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
+        iterations: int = 12, start_scale: float = 0.75, refine_iterations: int = 30,
         inlier_threshold: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         named_loss(loss)
         if isinstance(threshold, Mapping):
             if loss not in threshold:

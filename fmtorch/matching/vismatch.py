@@ -47,13 +47,9 @@ class VisMatch:
     peer_package: ClassVar[str] = "vismatch"
 
     def __init__(
-        self,
-        name: str,
-        max_features: Annotated[int, Within(1)] = 2048,
-        origin: float | None = None,
-        device: str = "auto",
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, name: str, max_features: Annotated[int, Within(1)] = 2048, origin: float | None = None,
+        device: str = "auto", options: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         vismatch = lazy.imported("vismatch", "matcher=vismatch needs vismatch: pip install 'fmtorch[vismatch]'")
         known = [str(each) for each in getattr(vismatch, "available_models", [])]
         if known and name not in known:

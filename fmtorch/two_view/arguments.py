@@ -51,16 +51,9 @@ FOCAL_NAMES = ("shared", "unknown")
 
 
 def correspondences(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    K0: Arrays | None = None,
-    K1: Arrays | None = None,
-    focal: Focal = None,
-    lens: Lens = None,
-    plane: bool = False,
-    **fields: Arrays | int | None,
-) -> Correspondences:
+    x0: Arrays, x1: Arrays, *, K0: Arrays | None = None, K1: Arrays | None = None, focal: Focal = None,
+    lens: Lens = None, plane: bool = False, **fields: Arrays | int | None,
+) -> Correspondences:  # fmt: skip
     """The batch that points and what is known of them and of the cameras describe, as of `fmtorch.find_fundamental`.
     x0, x1: whole numbers become float64, half precision float32; x0 decides the device. plane: x0 may be in the unit of
     a plane. fields: of `Correspondences`, or None. Raises TypeError for what is no array of numbers, ValueError for
