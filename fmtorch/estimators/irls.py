@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Estimation, Solution
@@ -102,7 +101,7 @@ class IterativelyReweighted:
         inliers = self.inlier_rule(residuals_squared_px(refined[best], pair), pair)
         return Solution(Fit(refined[best], refined[best], inliers.astype(np.float64)), 0, inliers)
 
-    def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+    def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[torch.Tensor, "p 9"]:
         """As `gradients.Attach`: one Gauss-Newton step, whose gradients are those of the optimum."""
         F = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(matches.points).reshape(-1, 3, 3)
         scale = torch.tensor([self.threshold / s.pair.pixels_per_unit for s in solved]).to(F)
