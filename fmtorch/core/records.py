@@ -171,9 +171,8 @@ class Record:
             raise ValueError(f"{path} is no file that save() wrote: {error}") from error
         kinds = {kind.__name__ for kind in (cls, *cls.__subclasses__())}
         if stored.get("record") not in kinds:
-            raise ValueError(
-                f"{path} holds {stored.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}"
-            )
+            record = stored.get("record", "no record")
+            raise ValueError(f"{path} holds {record}; {cls.__name__}.load reads {min(kinds)}")
         plain = json.loads(stored["fields"])
         return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
 

@@ -48,23 +48,17 @@ PARTS: dict[str, dict[str, Callable[..., Any]]] = {
     "solver": {"seven_point": SevenPoint, "eight_point": EightPoint, "four_point": Homography},
     "sampler": {"uniform": sampling.Uniform, "prosac": sampling.Prosac, "prior": sampling.PriorWeighted},
     "score": {
-        "inlier_count": scores.InlierCount,
-        "msac": scores.Msac,
-        "saturated": scores.SaturatedGains,
-        "magsac": scores.Magsac,
-        "median": scores.Median,
+        "inlier_count": scores.InlierCount, "msac": scores.Msac, "saturated": scores.SaturatedGains,
+        "magsac": scores.Magsac, "median": scores.Median,
     },
     "degeneracy": {"degensac": Degensac},
     "local_optimization": {"graph_cut": GraphCut},
     "inliers": {"threshold": inliers.WithinThreshold, "median": inliers.BetterHalf, "lmeds": inliers.RobustDeviations},
     "final": {
-        "none": NoFit,
-        "least_squares": LeastSquares,
-        "unweighted_least_squares": UnweightedLeastSquares,
-        "gauss_newton": GaussNewton,
-        "adaptive": Adaptive,
+        "none": NoFit, "least_squares": LeastSquares, "unweighted_least_squares": UnweightedLeastSquares,
+        "gauss_newton": GaussNewton, "adaptive": Adaptive,
     },
-}
+}  # fmt: skip
 """An option that names a part holds its name (``score: msac``), or a mapping of its name and options of its own
 (``score: {name: msac, prior_weighted: true}``), or an object: that of a user's `_target_`."""
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from fmtorch.core.checks import box_of, number
-from fmtorch.core.stages import Estimator, Pruner, calling, model_of, output_of
+from fmtorch.core.stages import Estimator, Pruner, called, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
@@ -58,9 +58,7 @@ def estimated_by(
 
 def _judged(estimator: Estimator, c: Correspondences, seed: int) -> Estimate:
     """The estimate of an estimator, which may be anybody's, with its significance."""
-    with calling("c, seed=0", estimator, c, seed):
-        estimate = estimator(c, seed)
-    return judged(output_of(estimator, estimate, Estimate, c), c)
+    return judged(output_of(estimator, called("c, seed=0", estimator, c, seed), Estimate, c), c)
 
 
 def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> None:
@@ -145,9 +143,8 @@ def given_sizes(size0: Size, size1: Size) -> tuple[Arrays | None, Arrays | None,
     if (size0 == "unknown") if isinstance(size0, str) else isinstance(size1, str):
         known = [name for name, size in (("size0", size0), ("size1", size1)) if not isinstance(size, str | None)]
         if known:
-            raise ValueError(
-                f"{known[0]} is given and the other is 'unknown'; give the sizes of both images, or neither"
-            )
+            wanted = "give the sizes of both images, or neither"
+            raise ValueError(f"{known[0]} is given and the other is 'unknown'; {wanted}")
         return None, None, False
     assert not isinstance(size0, str)
     assert not isinstance(size1, str)

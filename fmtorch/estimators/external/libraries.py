@@ -125,11 +125,8 @@ MAX_SEED = 2**31 - 1  # of 32 bits, as DEGENSAC takes them
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
 """The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC."""
 SUPERANSAC_SAMPLERS = {
-    "uniform": "Uniform",
-    "prosac": "PROSAC",
-    "importance": "ImportanceSampler",
-    "adaptive": "ARSampler",
-}
+    "uniform": "Uniform", "prosac": "PROSAC", "importance": "ImportanceSampler", "adaptive": "ARSampler",
+}  # fmt: skip
 SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 """The names of the parts in the binding of SupeRANSAC."""
 
