@@ -2,10 +2,11 @@
 
 Beside them the grey images that pruners look at, and the extractor of matchers that take the images themselves."""
 
+import contextlib
 import dataclasses
 import inspect
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
 
@@ -135,17 +136,23 @@ class WrongPart(TypeError, ValueError):
 
 
 def called(wanted: str, part: Any, *given: Any) -> Any:
-    """What a part returns, which may be anybody's code. wanted: the parameters that a part of this kind takes.
+    """What a part returns, see `calling`."""
+    with calling(wanted, part, *given):
+        return part(*given)
+
+
+@contextlib.contextmanager
+def calling(wanted: str, part: Any, *given: Any) -> Iterator[None]:
+    """Around a call of a part, which may be anybody's code. wanted: the parameters that a part of this kind takes.
     Raises WrongPart naming the place of one that takes others, that cannot be called, or that changes what it is given,
     RuntimeError for one that ends the program."""
     if not callable(part):
         raise WrongPart(f"{name_of(part)} cannot be called; it must have __call__({wanted})")
     before = _state(given)
     try:
-        output = part(*given)
+        yield
         if _state(given) != before:
             raise WrongPart(f"{name_of(part)} changes what it is given, which others use: it must change a copy")
-        return output
     except SystemExit as error:
         raise RuntimeError(f"{name_of(part)} ended the program: sys.exit({error.code!r})") from error
     except TypeError as error:

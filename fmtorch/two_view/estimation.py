@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from fmtorch.core.checks import box_of, number
-from fmtorch.core.stages import Estimator, Pruner, called, model_of, output_of
+from fmtorch.core.stages import Estimator, Pruner, calling, model_of, output_of
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.significance import judged
@@ -58,7 +58,9 @@ def estimated_by(
 
 def _judged(estimator: Estimator, c: Correspondences, seed: int) -> Estimate:
     """The estimate of an estimator, which may be anybody's, with its significance."""
-    return judged(output_of(estimator, called("c, seed=0", estimator, c, seed), Estimate, c), c)
+    with calling("c, seed=0", estimator, c, seed):
+        estimate = estimator(c, seed)
+    return judged(output_of(estimator, estimate, Estimate, c), c)
 
 
 def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> None:
