@@ -88,15 +88,9 @@ class Starter:
         return int(self._process.stdout.readline())
 
     def start(
-        self,
-        cwd: Path,
-        name: str,
-        *arguments: str,
-        before: str = "",
-        log: Path | None = None,
-        errors: Path | None = None,
-        environment: Mapping[str, str] | None = None,
-    ) -> Command:
+        self, cwd: Path, name: str, *arguments: str, before: str = "", log: Path | None = None,
+        errors: Path | None = None, environment: Mapping[str, str] | None = None,
+    ) -> Command:  # fmt: skip
         """``python -m fmtorch <name> arguments`` in a folder; before: Python code that runs first.
         name: of a command, or of a module, or ``-c``, before code to run. log, errors: files for standard output and
         standard error, which go into one in the folder if not given."""

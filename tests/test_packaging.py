@@ -73,8 +73,7 @@ def test_wheel_carries_the_licence_and_the_version(wheel: Path) -> None:
 
 
 def test_source_distribution_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
-    archive = _build(CHECKOUT, "sdist", tmp_path / "sdist")
-    with tarfile.open(archive) as file:
+    with tarfile.open(_build(CHECKOUT, "sdist", tmp_path / "sdist")) as file:
         file.extractall(tmp_path / "source", **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))
     (source,) = (tmp_path / "source").iterdir()
     assert (source / "constraints.txt").is_file()

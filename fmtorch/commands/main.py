@@ -91,18 +91,11 @@ def help_text(command: "Command") -> str:
     about = f"{summary[0].upper()}{summary[1:]}.\n{command.about}"
     presets = {**command.groups, **_replaced(str(command.groups.get("pipeline", "")))}
     groups = [_line(name, value, command.group_help.get(name, "")) for name, value in presets.items()]
-    options = [
-        _line(field.name, command.defaults[field.name], str(field.metadata["about"]))
-        for field in dataclasses.fields(command.options)
-    ]
-    parts = [
-        f"usage: fmtorch {command.name}{places} [NAME=VALUE ...]",
-        about,
-        "\n".join(["groups of presets:", *groups]) if groups else "",
-        "\n".join(["options:", *options]),
-        FOOTER,
-    ]
-    return "\n\n".join(filter(None, parts))
+    fields, defaults = dataclasses.fields(command.options), command.defaults
+    options = [_line(field.name, defaults[field.name], str(field.metadata["about"])) for field in fields]
+    usage = f"usage: fmtorch {command.name}{places} [NAME=VALUE ...]"
+    lists = [["groups of presets:", *groups] if groups else [], ["options:", *options]]
+    return "\n\n".join(filter(None, [usage, about, *map("\n".join, lists), FOOTER]))
 
 
 def _replaced(pipeline: str) -> dict[str, str]:

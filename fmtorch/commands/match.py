@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from omegaconf import DictConfig
-from rich.table import Table
+from rich.table import Column, Table
 
 from fmtorch import presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
@@ -280,10 +280,7 @@ def _troubles(result: MatchResult) -> list[str]:
 
 def _table(result: MatchResult, cached: bool) -> Table:
     """What each step left and took; cached: the features were computed by an earlier run, which took the seconds."""
-    table = Table()
-    table.add_column("step")
-    table.add_column("left", justify="right")
-    table.add_column("seconds", justify="right")
+    table = Table("step", Column("left", justify="right"), Column("seconds", justify="right"))
     for step, seconds in result.seconds.items():
         left, taken = f"{result.counts.get(step, 0):,} matches", f"{seconds:.3f}"
         if step == "features":

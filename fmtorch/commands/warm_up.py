@@ -43,5 +43,4 @@ def main() -> None:
         start = time.perf_counter()
         count = warm_up()
         seconds, processor = time.perf_counter() - start, cache.versions()["processor"]
-        kept = f"{count} kernels for {processor} in {seconds:.0f} s: {cache.folder()}"
-        console.print(kept, soft_wrap=True)
+        console.print(f"{count} kernels for {processor} in {seconds:.0f} s: {cache.folder()}", soft_wrap=True)

@@ -13,16 +13,15 @@ import os
 import re
 import sys
 import types
-import typing
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 T = TypeVar("T")
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
 MAX_NAMES = 12  # that a message lists
-UNIONS = (typing.Union, types.UnionType)
+UNIONS = (Union, types.UnionType)
 UNRESOLVED = (NameError, AttributeError, TypeError, SyntaxError)  # of annotations for type checkers alone
 
 
@@ -115,12 +114,12 @@ def expect_options(
 
 def fits(value: Any, annotation: Any) -> bool:
     """Whether a value may stand where an annotation is; what an annotation leaves open is not checked."""
-    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is typing.Annotated:
+    origin, args = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
         return fits(value, args[0]) and all(rule(value) for rule in args[1:] if callable(rule))
     if origin in UNIONS:
         return any(fits(value, option) for option in args)
-    if origin is typing.Literal:
+    if origin is Literal:
         return value in args
     if not isinstance(value, PLAIN) or (isinstance(value, Mapping) and "_target_" in value):
         return True
@@ -161,13 +160,13 @@ def _holds_a_list(kind: Any) -> bool:  # no protocol with attributes, of which i
 
 def expected(annotation: Any) -> str:
     """What fits an annotation, in words."""
-    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is typing.Annotated:
+    origin, args = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
         return " ".join([expected(args[0]), *(str(rule) for rule in args[1:])])
     if origin in UNIONS:
         words = list(dict.fromkeys(expected(option) for option in args if not (option is int and float in args)))
         return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
-    if origin is typing.Literal:
+    if origin is Literal:
         return f"one of: {', '.join(map(shown, args))}"
     names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
     if annotation in names:
@@ -204,7 +203,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 def dataclass_in(annotation: Any) -> type | None:
     """The dataclass that an annotation allows, if it is one."""
-    options = typing.get_args(annotation) if typing.get_origin(annotation) in UNIONS else ()
+    options = get_args(annotation) if get_origin(annotation) in UNIONS else ()
     kinds = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
     return kinds[0] if len(kinds) == 1 else None
 

@@ -7,10 +7,9 @@ of functions' arguments too, are read here alone, and only here is jaxtyping's f
 import dataclasses
 import inspect
 import json
-import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import torch
 from jaxtyping import AbstractArray, Int
@@ -56,7 +55,7 @@ class Expected(NamedTuple):
 
 def expectation(hint: Any) -> Expected:
     """What a resolved annotation asks for."""
-    alternatives = typing.get_args(hint) if typing.get_origin(hint) in UNIONS else (hint,)
+    alternatives = get_args(hint) if get_origin(hint) in UNIONS else (hint,)
     kinds = [alternative for alternative in alternatives if alternative is not type(None)]
     each = [_of_one(kind) for kind in kinds]
     expected = next((entry for entry in each if entry.kind == "array"), each[0] if len(each) == 1 else Expected(""))
@@ -66,15 +65,15 @@ def expectation(hint: Any) -> Expected:
 
 
 def _of_one(hint: Any) -> Expected:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Annotated:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
         rules = [rule for rule in arguments[1:] if isinstance(rule, Rule)]
         return _of_one(arguments[0])._replace(bounds=rules[0] if rules else None)
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return Expected("array", tuple(str(hint.dim_str).split()), hint.__name__.partition("[")[0])
     if origin is Sequence:
         return Expected("whole numbers" if arguments == (int,) else "numbers")
-    if origin is typing.Literal:
+    if origin is Literal:
         return Expected("choice", choices=arguments)
     if origin is Callable:
         return Expected("function")
@@ -83,13 +82,13 @@ def _of_one(hint: Any) -> Expected:
 
 def arguments_of(function: Callable[..., Any]) -> dict[str, Expected]:
     """What a function's annotations say of its parameters, by name."""
-    hints = typing.get_type_hints(function, include_extras=True)
+    hints = get_type_hints(function, include_extras=True)
     return {name: expectation(hints.get(name, Any)) for name in inspect.signature(function).parameters}
 
 
 def arrays_of(kind: type) -> dict[str, Expected]:
     """What the annotations of a class say of its arrays, by field."""
-    fields = {name: expectation(hint) for name, hint in typing.get_type_hints(kind, include_extras=True).items()}
+    fields = {name: expectation(hint) for name, hint in get_type_hints(kind, include_extras=True).items()}
     return {name: expected for name, expected in fields.items() if expected.kind == "array"}
 
 
@@ -172,9 +171,8 @@ class Record:
             raise ValueError(f"{path} is no file that save() wrote: {error}") from error
         kinds = {kind.__name__ for kind in (cls, *cls.__subclasses__())}
         if stored.get("record") not in kinds:
-            raise ValueError(
-                f"{path} holds {stored.get('record', 'no record')}; {cls.__name__}.load reads {min(kinds)}"
-            )
+            record = stored.get("record", "no record")
+            raise ValueError(f"{path} holds {record}; {cls.__name__}.load reads {min(kinds)}")
         plain = json.loads(stored["fields"])
         return cls(**tensors, **{name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()})
 

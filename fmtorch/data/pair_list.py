@@ -116,8 +116,7 @@ def camera_files(path: Path, root: Path) -> list[tuple[str, Path]]:
 
 def _megadepth(arrays: NpzArrays) -> Iterator[ListedPair]:
     names, intrinsics, poses = arrays["image_paths"], arrays["intrinsics"], arrays["poses"]
-    counts = {len(names), len(intrinsics), len(poses)}
-    if len(counts) > 1:
+    if len({len(names), len(intrinsics), len(poses)}) > 1:
         raise DataError(f"{arrays.path}: image_paths, intrinsics and poses must have one entry an image each")
     for record, info in enumerate(arrays["pair_infos"]):
         place = f"{arrays.path}, pair {record}"

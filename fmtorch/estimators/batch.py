@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
@@ -152,7 +151,7 @@ def relative_rounding(c: Correspondences) -> float:
     return torch.finfo(c.x0.dtype).eps if c.x0.dtype.is_floating_point else 0.0
 
 
-def shared_out(c: Correspondences) -> list[Tensor]:
+def shared_out(c: Correspondences) -> list[torch.Tensor]:
     """The rows of a batch in parts of about equal work, pairs of many matches first."""
     work, order = c.count().clamp_min(MIN_WORK).sort(descending=True)
     before = work.cumsum(0) - work
@@ -256,6 +255,6 @@ def _row(values: Array | None, i: int) -> Array:
     return np.empty(0) if values is None else np.ascontiguousarray(values[i], np.float64)
 
 
-def _array(tensor: Tensor) -> Array:
+def _array(tensor: torch.Tensor) -> Array:
     known = tensor.dtype in (torch.float32, torch.float64) or not tensor.is_floating_point()
     return as_array(tensor if known else tensor.to(torch.float64))

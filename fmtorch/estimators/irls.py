@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Estimation, Solution
@@ -56,16 +55,10 @@ class IterativelyReweighted:
     MIN_MATCHES = 8
 
     def __init__(
-        self,
-        *,
-        loss: str,
-        threshold: float | Mapping[str, float],
-        starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
-        iterations: int = 12,
-        start_scale: float = 0.75,
-        refine_iterations: int = 30,
+        self, *, loss: str, threshold: float | Mapping[str, float], starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
+        iterations: int = 12, start_scale: float = 0.75, refine_iterations: int = 30,
         inlier_threshold: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         named_loss(loss)
         if isinstance(threshold, Mapping):
             if loss not in threshold:
@@ -108,7 +101,7 @@ class IterativelyReweighted:
         inliers = self.inlier_rule(residuals_squared_px(refined[best], pair), pair)
         return Solution(Fit(refined[best], refined[best], inliers.astype(np.float64)), 0, inliers)
 
-    def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+    def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[torch.Tensor, "p 9"]:
         """As `gradients.Attach`: one Gauss-Newton step, whose gradients are those of the optimum."""
         F = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(matches.points).reshape(-1, 3, 3)
         scale = torch.tensor([self.threshold / s.pair.pixels_per_unit for s in solved]).to(F)

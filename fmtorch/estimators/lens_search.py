@@ -19,9 +19,8 @@ from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit, LensFit
-from fmtorch.geometry import levenberg_marquardt
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, rows_of, summation
+from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, minimiser, rows_of, summation
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
@@ -259,7 +258,7 @@ def _take(state: LensOptimum, trial: LensOptimum, k: int) -> None:
     posterior.take_cameras(state, trial, k)
 
 
-_minimise = levenberg_marquardt.minimiser(_evaluate, _step, _take, relative=False, min_damping=posterior.MIN_DAMPING)
+_minimise = minimiser(_evaluate, _step, _take, relative=False, min_damping=posterior.MIN_DAMPING)
 
 
 STARTS = ((0.0, 0.0), (-0.12, -0.12), (-0.25, -0.25))  # of both lenses, where they are one

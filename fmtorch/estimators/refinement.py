@@ -83,9 +83,8 @@ class Refinement:
         limit = np.float32(squared(self.options.RADIUS * self.options.scale / pair.pixels_per_unit))
         index = np.empty(min(self.options.matches, pair.count), np.int64)
         seed = pair.mixed_seed(Stream.REFINEMENT)
-        return pair.take(
-            index[: near_of(pair.residual)(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)]
-        )
+        count = near_of(pair.residual)(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)
+        return pair.take(index[:count])
 
     def __call__(self, pool: Pool, pair: Pair, family: Matrices) -> Candidates:
         F, near = pool.models, self.near(pool, pair)
@@ -222,8 +221,7 @@ class LeastSquares(NoFit):
     gradient, weighted = "least_squares", True
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
-        weighted = self.weighted and pair.prior is not None
-        weight = np.where(inliers, pair.weight if weighted else 1.0, 0.0)
+        weight = np.where(inliers, pair.weight if self.weighted and pair.prior is not None else 1.0, 0.0)
         return Fit(family.least_squares(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
 
 

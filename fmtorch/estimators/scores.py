@@ -163,9 +163,8 @@ def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
     scores = score(F, which, pair)
     if not isinstance(scores, np.ndarray) or scores.shape != which.shape or scores.dtype != np.float64:
         what = f"{scores.dtype} {scores.shape}" if isinstance(scores, np.ndarray) else type(scores).__name__
-        raise ValueError(
-            f"{type(score).__name__} returns {what}; it must be an array of float64 {which.shape}: one number a model"
-        )
+        wanted = f"an array of float64 {which.shape}: one number a model"
+        raise ValueError(f"{type(score).__name__} returns {what}; it must be {wanted}")
     return np.ascontiguousarray(scores)
 
 

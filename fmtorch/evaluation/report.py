@@ -144,16 +144,12 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
     return {
-        "heading": section.heading,
+        "heading": section.heading, "pairs": section.pairs, "notes": section.notes,
         "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",
         "legend": tables.caption(next(iter(summaries.values()))),
-        "tables": tables.report_tables(section.runs, summaries),
-        "names": list(section.runs),
-        "axis": axis.label,
+        "tables": tables.report_tables(section.runs, summaries), "names": list(section.runs), "axis": axis.label,
         "curves": [(name, curves.svg(name, panel, names, axis)) for name, panel in curves.panels(section.runs).items()],
-        "pairs": section.pairs,
-        "notes": section.notes,
-    }
+    }  # fmt: skip
 
 
 MAX_OPTIONS = 3  # that a name tells of a stage; of more the identity's first digits do

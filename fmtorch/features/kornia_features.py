@@ -56,14 +56,9 @@ class DISK(_NetworkFeatures):
     released one. Raises ConnectionError where the weights cannot be fetched."""
 
     def __init__(
-        self,
-        weights: str = "depth",
-        max_features: Annotated[int, Within(1)] = 2048,
-        window: int = 5,
-        score_threshold: float = 0.0,
-        device: str = "auto",
-        network: nn.Module | None = None,
-    ) -> None:
+        self, weights: str = "depth", max_features: Annotated[int, Within(1)] = 2048, window: int = 5,
+        score_threshold: float = 0.0, device: str = "auto", network: nn.Module | None = None,
+    ) -> None:  # fmt: skip
         known = kornia.feature.disk.disk.urls
         if weights not in known:
             raise ValueError(f"no weights {weights!r} of DISK; there are: {', '.join(known)}")
@@ -87,14 +82,9 @@ class ALIKED(_NetworkFeatures):
     in pixels. device, network, errors: as of `DISK`."""
 
     def __init__(
-        self,
-        weights: str = "aliked-n16",
-        max_features: Annotated[int, Within(1)] = 2048,
-        score_threshold: float = 0.2,
-        radius: int = 2,
-        device: str = "auto",
-        network: nn.Module | None = None,
-    ) -> None:
+        self, weights: str = "aliked-n16", max_features: Annotated[int, Within(1)] = 2048, score_threshold: float = 0.2,
+        radius: int = 2, device: str = "auto", network: nn.Module | None = None,
+    ) -> None:  # fmt: skip
         known = kornia.feature.aliked.aliked._ALIKED_CFGS
         if weights not in known:
             raise ValueError(f"no weights {weights!r} of ALIKED; there are: {', '.join(known)}")
@@ -122,12 +112,9 @@ class XFeat(_NetworkFeatures):
     cpu, cuda. network: in place of the released one. Raises ConnectionError where the weights cannot be fetched."""
 
     def __init__(
-        self,
-        max_features: Annotated[int, Within(1)] = 2048,
-        score_threshold: float = 0.05,
-        device: str = "auto",
+        self, max_features: Annotated[int, Within(1)] = 2048, score_threshold: float = 0.05, device: str = "auto",
         network: nn.Module | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         network = network or pretrained(
             lambda: kornia.feature.XFeat.from_pretrained(detection_threshold=score_threshold),
             "XFeat", "github.com/verlab/accelerated_features", "xfeat.pt",

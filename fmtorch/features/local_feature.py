@@ -170,14 +170,9 @@ Choice = str | Options  # a part's name, or a mapping with its `name` and option
 
 
 def local_feature(
-    detector: Choice,
-    descriptor: Choice,
-    shape: Choice | None = None,
-    orientation: Choice | None = None,
-    max_features: Annotated[int, Within(1)] = 8000,
-    precision: str = "fp32",
-    threads: int = 1,
-) -> LocalFeature:
+    detector: Choice, descriptor: Choice, shape: Choice | None = None, orientation: Choice | None = None,
+    max_features: Annotated[int, Within(1)] = 8000, precision: str = "fp32", threads: int = 1,
+) -> LocalFeature:  # fmt: skip
     """A `LocalFeature` of named parts.
     detector: `dog` (options of `SIFT`) or `hessian` (options of `HessianDetector`), at most `max_features` of them.
     shape: None, `affnet` or `affnet_fast`. orientation: None for the detector's, `dominant_gradient` or `orinet`.

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.core import Features, Within, lazy
 from fmtorch.features.describe import root_sift
@@ -48,7 +47,7 @@ class SIFT:
         size = torch.tensor(grey.shape, dtype=torch.int64)
         return Features(lafs, scores, root_sift(features) if self.root else features, size)
 
-    def detect(self, image: Image) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    def detect(self, image: Image) -> tuple[Float[torch.Tensor, "n 2 3"], Float[torch.Tensor, " n"]]:
         """The frames and scores of the features that a call finds, without their descriptors."""
         grey = as_grey(image)
         seen = self._reduced(grey)
@@ -68,7 +67,7 @@ class SIFT:
 
     def _kept(
         self, keypoints: Sequence[cv2.KeyPoint], seen: tuple[int, ...], shape: tuple[int, ...]
-    ) -> tuple[Tensor, Tensor, NDArray[np.int64]]:
+    ) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64]]:
         """The frames and scores of the strongest keypoints, and which these are; from the image seen to the image."""
         scores = np.array([k.response for k in keypoints], np.float32)
         kept = strongest(scores, self.max_features)
@@ -80,7 +79,7 @@ class SIFT:
         return lafs, torch.from_numpy(scores[kept]), kept
 
 
-def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3"]:
+def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[torch.Tensor, "n 2 3"]:
     """OpenCV's keypoints as local affine frames.
     The half side is `FRAME_SIGMAS` times half of `size`, which is a diameter; kornia's angle is minus OpenCV's."""
     table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], np.float32).reshape(-1, 4)

@@ -82,8 +82,7 @@ class HlocMatches(_OpenFiles):
         return np.stack([first, second], -1)
 
     def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
-        h5py = h5.imported()
-        with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
+        with replacing(self._output) as temporary, h5.imported().File(temporary, "w") as file:
             for pair, geometry in geometries:
                 group = file.create_group(self._keys[pair])
                 second = np.full(len(self.image(pair[0]).points), predictions.NO_MATCH, np.int32)

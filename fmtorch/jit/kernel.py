@@ -306,13 +306,9 @@ PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel f
 
 
 def for_each_pair(
-    function: Callable[..., None],
-    tensors: Sequence[Tensor | None],
-    *constants: Any,
-    out: Tensor,
-    kind: torch.dtype = torch.float32,
-    group: Callable[..., Any] | None = None,
-) -> Tensor:
+    function: Callable[..., None], tensors: Sequence[Tensor | None], *constants: Any, out: Tensor,
+    kind: torch.dtype = torch.float32, group: Callable[..., Any] | None = None,
+) -> Tensor:  # fmt: skip
     """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
     Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
     NamedTuple in which the function takes the rows. Pairs are shared out among threads. What is on another device is

@@ -6,9 +6,8 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numba
 from llvmlite import ir
-from numba import types
+from numba import TypingError, types
 from numba.core import cgutils, registry
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
@@ -169,7 +168,7 @@ def store(context: Any, A: Any, row: Any, value: Any) -> Any:
     """`lanes.store`."""
     kinds = list(value) if isinstance(value, types.BaseTuple) else [value]
     if any(A.dtype != kind.dtype for kind in kinds):
-        raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
+        raise TypingError(f"{value} cannot be stored in an array of {A.dtype}")
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = context.get_data_type(A.dtype)
@@ -188,7 +187,7 @@ def where(context: Any, mask: Any, this: Any, other: Any) -> Any:
     """`lanes.where`."""
     kind = operands((this, other))
     if kind is None or mask != kind.mask:
-        raise numba.TypingError(f"where of {mask}, {this} and {other}")
+        raise TypingError(f"where of {mask}, {this} and {other}")
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         first = filled(context, builder, args[1], this, kind)

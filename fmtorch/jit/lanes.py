@@ -146,9 +146,7 @@ class _Fused(Inner[[Any, Any, Any], Any]):
         return numba.njit(**OPTIONS, no_cpython_wrapper=True)(inspect.unwrap(fused))
 
 
-def _fused(a: Any, b: Any, c: Any) -> Any:
+@_Fused
+def fused(a: Any, b: Any, c: Any) -> Any:
     """a + b c of float32 numbers, rounded once, to float32."""
     return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
-
-
-fused = _Fused(_fused)

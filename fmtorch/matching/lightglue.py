@@ -7,11 +7,8 @@ from torch import Tensor, nn
 from fmtorch.core.onnx_network import pretrained
 from fmtorch.core.types import Correspondences, Features
 
-FEATURES = (
-    "aliked",
-    "disk",
-    "xfeat",
-)  # those that need no more than positions and descriptors, and that this project reads
+# Those that need no more than positions and descriptors, and that this project reads
+FEATURES = ("aliked", "disk", "xfeat")
 
 
 class LightGlue:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.core import lazy
 from fmtorch.core.options import Within, nearest
@@ -47,13 +46,9 @@ class VisMatch:
     peer_package: ClassVar[str] = "vismatch"
 
     def __init__(
-        self,
-        name: str,
-        max_features: Annotated[int, Within(1)] = 2048,
-        origin: float | None = None,
-        device: str = "auto",
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+        self, name: str, max_features: Annotated[int, Within(1)] = 2048, origin: float | None = None,
+        device: str = "auto", options: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         vismatch = lazy.imported("vismatch", "matcher=vismatch needs vismatch: pip install 'fmtorch[vismatch]'")
         known = [str(each) for each in getattr(vismatch, "available_models", [])]
         if known and name not in known:
@@ -121,13 +116,13 @@ def _correspondences(
     return Correspondences(**fields, mask=torch.from_numpy(mask)[None], size0=size0, size1=size1)
 
 
-def _tensor(image: Image) -> Float[Tensor, "3 h w"]:
+def _tensor(image: Image) -> Float[torch.Tensor, "3 h w"]:
     channels = np.broadcast_to(image if image.ndim == 3 else image[..., None], (*image.shape[:2], 3))
     return torch.from_numpy(channels.transpose(2, 0, 1).copy()).to(torch.float32) / 255
 
 
 def _numbers(value: Any) -> Array:
-    return np.asarray(value.detach().to(torch.float64).cpu() if isinstance(value, Tensor) else value, np.float64)
+    return np.asarray(value.detach().to(torch.float64).cpu() if isinstance(value, torch.Tensor) else value, np.float64)
 
 
 def _described(error: Exception) -> str:

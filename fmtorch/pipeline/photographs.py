@@ -110,8 +110,7 @@ class PhotographCameras:
         known = self.knowledge(*(self.of(path, size) for path, size in zip(paths, sizes, strict=True)))
         lenses = known.get("lens", (None, None))
         K0, K1 = (known.get(f"K{i}") if lens is None else lens.K for i, lens in enumerate(lenses))
-        fields = camera_fields(K0, K1, known.get("focal"), sizes_known=True)
-        return {"cameras": fields, "lenses": lenses}
+        return {"cameras": camera_fields(K0, K1, known.get("focal"), sizes_known=True), "lenses": lenses}
 
 
 def _pinhole(K: str | Sequence[float | int]) -> Lens:

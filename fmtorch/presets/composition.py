@@ -3,11 +3,10 @@
 import dataclasses
 import functools
 import threading
-import typing
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar, cast, get_args, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import hydra
 import torch
@@ -233,7 +232,7 @@ def _as(hint: Any, value: Any) -> Any:
     """A value of a config as its type has it: texts as paths, lists as tuples, mappings as dataclasses."""
     if isinstance(value, str) and _is_path(hint):
         return Path(value)
-    if isinstance(value, list) and typing.get_origin(hint) is tuple:
+    if isinstance(value, list) and get_origin(hint) is tuple:
         return tuple(value)
     kind = dataclass_in(hint)
     return _built(kind, value) if isinstance(value, Mapping) and kind is not None else value

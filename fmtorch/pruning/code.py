@@ -301,17 +301,10 @@ class CODE:
     every match and gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`."""
 
     def __init__(
-        self,
-        *,
-        odds: float,
-        floor: float,
-        reach: float,
-        least_likelihood: float = MIN_LIKELIHOOD,
-        largest_residual: float = LARGEST_RESIDUAL,
-        soft: bool = False,
-        likelihood: Mapping[str, Any] | None = None,
+        self, *, odds: float, floor: float, reach: float, least_likelihood: float = MIN_LIKELIHOOD,
+        largest_residual: float = LARGEST_RESIDUAL, soft: bool = False, likelihood: Mapping[str, Any] | None = None,
         motion: Mapping[str, Any] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.odds, self.floor, self.reach, self.soft = odds, floor, reach, soft
         self.least_likelihood, self.largest_residual = least_likelihood, largest_residual
         self.likelihood, self.motion = LikelihoodField(**(likelihood or {})), SmoothMotion(**(motion or {}))

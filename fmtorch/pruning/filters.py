@@ -322,15 +322,9 @@ class GMS:
     Raises ValueError for the soft form without a calibration, and for correspondences without image sizes."""
 
     def __init__(
-        self,
-        *,
-        with_rotation: bool = False,
-        with_scale: bool = False,
-        threshold_factor: float = 6.0,
-        border: Border = "opencv",
-        soft: bool = False,
-        calibration: Mapping[str, Mapping[str, float]] | None = None,
-    ) -> None:
+        self, *, with_rotation: bool = False, with_scale: bool = False, threshold_factor: float = 6.0,
+        border: Border = "opencv", soft: bool = False, calibration: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:  # fmt: skip
         self._options: dict[str, Any] = {"with_rotation": with_rotation, "with_scale": with_scale, "border": border}
         self._options["threshold_factor"] = threshold_factor
         self.calibration = calibration_of("GMS", soft, calibration)

@@ -319,14 +319,10 @@ class LPM:
     `Calibration`; needed by the soft form alone, which raises ValueError without it."""
 
     def __init__(
-        self,
-        *,
-        thresholds: Sequence[float] = (0.8, 0.5),
-        neighbors: Sequence[int] = (6, 6),
-        taus: Sequence[float] = (0.2, 0.2),
-        soft: bool = False,
+        self, *, thresholds: Sequence[float] = (0.8, 0.5), neighbors: Sequence[int] = (6, 6),
+        taus: Sequence[float] = (0.2, 0.2), soft: bool = False,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._options: dict[str, Any] = {"thresholds": thresholds, "neighbors": neighbors, "taus": taus}
         self.calibration = calibration_of("LPM", soft, calibration)
 

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from fmtorch.core import Correspondences, GreyPyramid, PairImages
 from fmtorch.geometry.arithmetic import sqrt
@@ -406,7 +405,7 @@ class RefineMatches:
         variance = (xx + yy) / (1 + area)
         return np.asarray(np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual)
 
-    def _doubt(self, prior: Tensor | None, pair: int, index: Tensor) -> Any:
+    def _doubt(self, prior: torch.Tensor | None, pair: int, index: torch.Tensor) -> Any:
         """P^(-1/4) of these matches."""
         if prior is None:
             return 1.0
@@ -429,10 +428,10 @@ def _product(a: Array, b: Array) -> Array:
     return a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]  # type: ignore[no-any-return]
 
 
-def _array(tensor: Tensor) -> Array:
+def _array(tensor: torch.Tensor) -> Array:
     tensor = tensor.detach().cpu()
     return (tensor.to(torch.float64) if tensor.is_floating_point() else tensor).contiguous().numpy()
 
 
-def _like(array: Array, tensor: Tensor) -> Tensor:
+def _like(array: Array, tensor: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(array).to(tensor)

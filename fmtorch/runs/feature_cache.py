@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.core import Features, files
 from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor, called, output_of
@@ -183,7 +182,7 @@ class CachedFeatures:
         self.cache.describe(section, identity)
         return section
 
-    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> "_Step":
+    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, torch.Tensor]]) -> "_Step":
         arrays = self.cache.read(section, digest)
         if arrays is not None:
             seconds = float(arrays.pop("seconds"))
@@ -220,12 +219,12 @@ def image_digest(image: NDArray[np.uint8]) -> str:
 
 
 class _Step(NamedTuple):
-    tensors: dict[str, Tensor]
+    tensors: dict[str, torch.Tensor]
     seconds: float
     computed: bool
 
 
-def _packed(value: Tensor) -> NDArray[Any]:
+def _packed(value: torch.Tensor) -> NDArray[Any]:
     """The array of a tensor; bytes where every element is a whole number from 0 to 255, as SIFT's are."""
     array = value.numpy()
     if array.dtype == np.float32:

@@ -236,8 +236,7 @@ def export_onnx(network: nn.Module, path: Path, *, temperature: float = 1.0) -> 
         onnx.save(model, unfinished)
         x = torch.rand(1, parts.input_channels, 3 * EXAMPLE_MATCHES)
         slots = layers.Slots(torch.tensor([float(x.shape[2])]), None)
-        exported = learned.OnnxBackbone(network, unfinished, "")(x, slots)
-        expect_equal(unfinished, exported, alone(x))
+        expect_equal(unfinished, learned.OnnxBackbone(network, unfinished, "")(x, slots), alone(x))
 
 
 def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, free_axis: int) -> Any:

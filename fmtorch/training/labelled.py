@@ -96,8 +96,7 @@ class LabelledMatches(records.Record):
 def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
     """One padded batch from several, with the optional fields that all have. Raises ValueError for an empty list."""
     c = types.collate([item.correspondences for item in items])
-    n = c.x0.shape[1]
-    label = torch.cat([_padded(item.label, n) for item in items])
+    label = torch.cat([_padded(item.label, c.x0.shape[1]) for item in items])
     return LabelledMatches(c, label, torch.cat([item.F for item in items]))
 
 

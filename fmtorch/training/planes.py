@@ -131,8 +131,7 @@ class PlanePairs(HeldPairs):
             folder.mkdir(parents=True, exist_ok=True)
             view = warp(grey_of(rng, picture), plane_homography(cameras[-1], (h, w)), cameras[-1].size)
             view = change_camera(rng, change_light(rng, view))
-            coded = cv2.imencode(".jpg", view, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-            write_whole(path, coded.tobytes())
+            write_whole(path, cv2.imencode(".jpg", view, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
         return cameras
 
 

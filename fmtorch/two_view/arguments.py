@@ -51,16 +51,9 @@ FOCAL_NAMES = ("shared", "unknown")
 
 
 def correspondences(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    K0: Arrays | None = None,
-    K1: Arrays | None = None,
-    focal: Focal = None,
-    lens: Lens = None,
-    plane: bool = False,
-    **fields: Arrays | int | None,
-) -> Correspondences:
+    x0: Arrays, x1: Arrays, *, K0: Arrays | None = None, K1: Arrays | None = None, focal: Focal = None,
+    lens: Lens = None, plane: bool = False, **fields: Arrays | int | None,
+) -> Correspondences:  # fmt: skip
     """The batch that points and what is known of them and of the cameras describe, as of `fmtorch.find_fundamental`.
     x0, x1: whole numbers become float64, half precision float32; x0 decides the device. plane: x0 may be in the unit of
     a plane. fields: of `Correspondences`, or None. Raises TypeError for what is no array of numbers, ValueError for
@@ -187,9 +180,8 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
         return tensor.expand(len(points), *shape)
     if tuple(tensor.shape) != (len(points), *shape):
         single_shape = f"{shape} for all pairs" if shape else "one number for all pairs"
-        raise ValueError(
-            f"{name} has shape {tuple(tensor.shape)}; it must be {single_shape}, or {(len(points), *shape)}"
-        )
+        wanted = f"{single_shape}, or {(len(points), *shape)}"
+        raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it must be {wanted}")
     return tensor
 
 
@@ -211,18 +203,16 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
         own = {name: fields[name][i] for name in PER_MATCH if fields.get(name) is not None}
         pairs.append(_one_of_list(i, x0[i], x1[i], {**own, **{name: value[i] for name, value in batch_fields.items()}}))
     device, kind = pairs[0].x0.device, functools.reduce(torch.promote_types, (pair.x0.dtype for pair in pairs))
-    return collate(
-        [pair.to(device).replace(x0=pair.x0.to(device, kind), x1=pair.x1.to(device, kind)) for pair in pairs]
-    )
+    alike = [pair.to(device).replace(x0=pair.x0.to(device, kind), x1=pair.x1.to(device, kind)) for pair in pairs]
+    return collate(alike)
 
 
 def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Correspondences:
     try:
         points0, points1 = as_tensor(x0, "x0"), as_tensor(x1, "x1")
         if points0.dim() != 2 or points1.dim() != 2:
-            raise ValueError(
-                f"x0 and x1 have shapes {tuple(points0.shape)} and {tuple(points1.shape)}; both must be (N, 2)"
-            )
+            shapes = f"{tuple(points0.shape)} and {tuple(points1.shape)}"
+            raise ValueError(f"x0 and x1 have shapes {shapes}; both must be (N, 2)")
         return _batch(points0, points1, fields)
     except (TypeError, ValueError) as error:
         raise type(error)(f"pair {i}: {error}") from error

@@ -9,7 +9,6 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from fmtorch.core.checks import box_of, number
 from fmtorch.core.stages import Estimator, Pruner, calling, model_of, output_of
@@ -146,16 +145,15 @@ def given_sizes(size0: Size, size1: Size) -> tuple[Arrays | None, Arrays | None,
     if (size0 == "unknown") if isinstance(size0, str) else isinstance(size1, str):
         known = [name for name, size in (("size0", size0), ("size1", size1)) if not isinstance(size, str | None)]
         if known:
-            raise ValueError(
-                f"{known[0]} is given and the other is 'unknown'; give the sizes of both images, or neither"
-            )
+            wanted = "give the sizes of both images, or neither"
+            raise ValueError(f"{known[0]} is given and the other is 'unknown'; {wanted}")
         return None, None, False
     assert not isinstance(size0, str)
     assert not isinstance(size1, str)
     return size0, size1, size0 is None and size1 is None
 
 
-def extents(c: Correspondences) -> tuple[Float[Tensor, "b 2 2"], Bool[Tensor, " b"]]:
+def extents(c: Correspondences) -> tuple[Float[torch.Tensor, "b 2 2"], Bool[torch.Tensor, " b"]]:
     """Sizes (h, w) of images whose points spread evenly up to the border, and of which pairs these tell any: of those
     whose points look like a photograph's. Centred, normalised and undistorted points have negative coordinates."""
     both = c.mask & c.x0.isfinite().all(-1) & c.x1.isfinite().all(-1)
@@ -182,14 +180,14 @@ def with_assumed_sizes(c: Correspondences, estimate: Callable[[Correspondences],
     row = torch.cat([rows.nonzero()[:, 0] for rows, _ in tried])
     place = torch.argsort(row[: len(c)])
     second = torch.arange(len(c), len(row), device=row.device)  # of the doubtful ones, of two sizes
-    significance = cast(Tensor, together.significance)
+    significance = cast(torch.Tensor, together.significance)
     better = together.ok[second] & ~(significance[second] - significance[place[doubtful]] <= TWO_SIZES_GAIN)
     place = place.masked_scatter(doubtful, torch.where(better, second, place[doubtful]))
     sizes = torch.cat([sizes[rows] for rows, sizes in tried])
     return together[place].derived(sizes=sizes[place], sizes_doubtful=doubtful)
 
 
-def _sized(c: Correspondences, rows: Tensor, sizes: Tensor) -> Correspondences:
+def _sized(c: Correspondences, rows: torch.Tensor, sizes: torch.Tensor) -> Correspondences:
     """Some pairs of a batch with their sizes, as they are where there are none."""
     c, sizes = (c, sizes) if bool(rows.all()) else (c[rows], sizes[rows])
     return c.derived(size0=sizes[:, 0], size1=sizes[:, 1]) if bool(sizes.isfinite().all()) else c

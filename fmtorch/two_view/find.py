@@ -135,8 +135,8 @@ def find_fundamental(
         if size0 is None or isinstance(size0, str):
             raise ValueError("covariance needs K0 and K1, or the image sizes: give size0 and size1")
         focal = "unknown"
-    if lens is not None:
-        _expect_lens(size0, K0 is not None or K1 is not None)
+    if lens is not None and (isinstance(size0, str) or (size0 is None and (K0 is not None or K1 is not None))):
+        raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
     h0w0, h1w1, assume_sizes = given_sizes(size0, size1)
     c = correspondences(
         x0, x1, mask=mask, ratio=ratio, score=score, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=h0w0,
@@ -163,11 +163,6 @@ def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None 
     from fmtorch.two_view.lenses import CalibratedLenses
 
     return CalibratedLenses(lens, x0, K0, K1)
-
-
-def _expect_lens(size: Size, calibrated: bool) -> None:
-    if isinstance(size, str) or (calibrated and size is None):
-        raise ValueError("lens needs the image sizes, in whose half diagonals it is: give size0 and size1")
 
 
 @eager
@@ -232,25 +227,11 @@ def find_essential(
 @eager
 @one_thread("cpu")
 def find_homography(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    estimator: str = "homography",
-    mask: Arrays | None = None,
-    ratio: Arrays | None = None,
-    score: Arrays | None = None,
-    prior: Arrays | None = None,
-    lafs0: Arrays | None = None,
-    lafs1: Arrays | None = None,
-    noise: Arrays | None = None,
-    size0: Arrays | None = None,
-    size1: Arrays | None = None,
-    lens: Lens = None,
-    key: Arrays | int | None = None,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
-    **options: Any,
-) -> Estimate:
+    x0: Arrays, x1: Arrays, *, estimator: str = "homography", mask: Arrays | None = None, ratio: Arrays | None = None,
+    score: Arrays | None = None, prior: Arrays | None = None, lafs0: Arrays | None = None, lafs1: Arrays | None = None,
+    noise: Arrays | None = None, size0: Arrays | None = None, size1: Arrays | None = None, lens: Lens = None,
+    key: Arrays | int | None = None, seed: int = 0, config_dir: Path | str | None = None, **options: Any,
+) -> Estimate:  # fmt: skip
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:

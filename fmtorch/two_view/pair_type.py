@@ -68,13 +68,9 @@ def compile_with(stages: Iterable[object]) -> None:
 
 
 def classify(
-    c: Correspondences,
-    estimate: Estimate,
-    *,
-    focal_deviation: float | int = FOCAL_DEVIATION,
-    seed: int = 0,
+    c: Correspondences, estimate: Estimate, *, focal_deviation: float | int = FOCAL_DEVIATION, seed: int = 0,
     **options: Any,
-) -> PairTypes:
+) -> PairTypes:  # fmt: skip
     """The type of each pair, by the evidence of its F, of a homography, a rotation and a copy.
 
     No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Calibrations

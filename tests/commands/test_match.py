@@ -108,8 +108,7 @@ def test_reduction_gives_pixels_of_the_originals(pipeline: fmtorch.Pipeline) -> 
 
 def test_photographs_that_cannot_be_related(pipeline: fmtorch.Pipeline) -> None:
     image = stereo()[0]
-    flat = np.full((100, 120, 3), 90, np.uint8)
-    for other in (flat, image[:1]):
+    for other in (np.full((100, 120, 3), 90, np.uint8), image[:1]):
         result = fmtorch.match(image, other, pipeline=pipeline)
         assert not result.ok
         assert "no keypoints in image1" in result.reason

@@ -95,8 +95,7 @@ def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(tmp_path, m
 
     def order(*runs: str, by: str = "null") -> list[str]:
         words = (f"runs=[{','.join(runs)}]", f"order={by}", "output=deep/report.html", "cache=off")
-        output = report.run(compose("report", words))
-        return re.findall(r'<li data-run="(\w)"', output.read_text())
+        return re.findall(r'<li data-run="(\w)"', report.run(compose("report", words)).read_text())
 
     assert order("runs") == order("runs/a", "runs/b", "runs/c", by="recall") == ["b", "a", "c"]
     assert order("runs/c", "runs/b", "runs/a") == ["c", "b", "a"]
@@ -206,8 +205,7 @@ def test_before_any_work(monkeypatch: pytest.MonkeyPatch, photographs: Path, wor
 
 
 def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    RunFolder.open(run, {})
+    RunFolder.open(tmp_path / "run", {})
     monkeypatch.setattr("fmtorch.commands.report.gallery", lambda *_: pytest.fail("the work was begun"))
     monkeypatch.setattr("fmtorch.commands.report.named", lambda _: [])
     end = ended(monkeypatch, tmp_path, "report", "runs=run", "output=run")

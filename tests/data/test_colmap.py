@@ -174,8 +174,7 @@ def manuals_pixels(camera: dict[str, np.ndarray], h: int, w: int, distorted: boo
 
 def test_points_are_where_the_manual_puts_them(tmp_path: Path) -> None:
     folder, truth = write_bundler(tmp_path / "Set/scene")
-    dataset = load("bundler", root=folder, pairs=None)
-    views = dataset.scenes[0].views  # type: ignore[attr-defined]
+    views = load("bundler", root=folder, pairs=None).scenes[0].views  # type: ignore[attr-defined]
     assert [view.image.path.name for view in views] == ["0.png", "1.png", "2.png", "4.png"]  # 3 was not registered
     for view, camera in zip(views, [truth[i] for i in (0, 1, 2, 4)], strict=True):
         h, w = view.image.size

@@ -109,8 +109,7 @@ def test_an_undistorted_photograph_is_what_the_pinhole_sees(model: str) -> None:
 def test_where_a_polynomial_folds_back_the_image_is_black() -> None:
     """With k = -0.5 the distorted radius grows up to sqrt(2/3) and then shrinks: a ghost of the centre would follow."""
     folding = Lens(60.0, 60.0, 79.5, 59.5, "SIMPLE_RADIAL", (-0.5,))
-    image = np.full(SIZE, 200, np.uint8)
-    result = undistorted(image, folding)
+    result = undistorted(np.full(SIZE, 200, np.uint8), folding)
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     radius = np.hypot(x - 79.5, y - 59.5) / 60
     turning = np.sqrt(2 / 3)
@@ -175,8 +174,7 @@ def test_an_image_source_is_resized_then_turned(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     image = np.random.default_rng(0).integers(0, 256, (*RESAMPLED_SIZE, 3), np.uint8)
     assert cv2.imwrite(str(path), image)
-    change = Resampling((3, 5), 1)
-    source = ImageSource("a", path, RESAMPLED_SIZE, resampling=change)
+    source = ImageSource("a", path, RESAMPLED_SIZE, resampling=Resampling((3, 5), 1))
     small = cv2.resize(image[..., ::-1], (5, 3), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(read_image(source), np.rot90(small))
     assert source.pixels != ImageSource("a", path, RESAMPLED_SIZE).pixels

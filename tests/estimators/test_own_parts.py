@@ -143,8 +143,7 @@ def compared(preset: str) -> None:
     score = own_parts.Squares(1.0) if preset == "msac" else own_parts.Welsch(1.5, prior_weighted=True)
     threshold = {} if preset == "msac" else {"threshold": None}
     parts = {"score": score, "sampler": own_parts.AllAlike(), "inliers": own_parts.Within2Px()}
-    own = presets.build("estimator", preset, **parts, **threshold)
-    estimators = own, presets.build("estimator", preset)
+    estimators = presets.build("estimator", preset, **parts, **threshold), presets.build("estimator", preset)
     draws, fastest = [int(estimator(c).samples) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
         for k, estimator in enumerate(estimators):

@@ -189,8 +189,7 @@ def test_points_of_a_line_are_told_from_points_near_one(scale: float, shift: flo
 
 @pytest.mark.parametrize("count", [0, 6, 7])
 def test_inliers_count_once_at_one_place_and_late_ones_are_seen(count: int) -> None:
-    rng = np.random.default_rng(1)
-    x = rng.uniform(0, 500, (1000, 4))
+    x = np.random.default_rng(1).uniform(0, 500, (1000, 4))
     few = f"the best model has {count} different inliers; at least 7 are needed" if count < 7 else ""
     for first in (0, 100, preselection.FIRST_LOOK - 3, 900):
         inliers = np.zeros(1000, np.bool_)

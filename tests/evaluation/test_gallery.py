@@ -207,8 +207,7 @@ def test_a_run_has_a_picture_of_all_and_of_each_family(families: list[str], curv
 
 
 def test_a_curve_is_the_share_of_pairs_below_each_threshold() -> None:
-    plot = svg("t", {"run": np.array([0.01, 0.06, 0.1501, 1.0])}, ["run"])
-    (line,) = re.findall(r' d="M([^"]+)"', plot)
+    (line,) = re.findall(r' d="M([^"]+)"', svg("t", {"run": np.array([0.01, 0.06, 0.1501, 1.0])}, ["run"]))
     x, y = np.array([point.split(",") for point in line.split("L")], float).T
     share = (y[0] - y) / (y[0] - 10)  # the margin at the top
     threshold = (x - x[0]) / (x[-1] - x[0]) * 0.2

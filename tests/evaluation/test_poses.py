@@ -98,8 +98,7 @@ def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_est
         assert row.rotation_error == folded.rotation_error
     failed = dataclasses.replace(outcomes[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
     zero = outcomes[1].estimate.replace(matrix=torch.zeros(1, 3, 3).double())
-    nothing = dataclasses.replace(outcomes[1], estimate=zero)
-    rows = evaluation.evaluate([failed, nothing], signed=True)
+    rows = evaluation.evaluate([failed, dataclasses.replace(outcomes[1], estimate=zero)], signed=True)
     assert [(row.rotation_error, row.translation_error) for row in rows] == [(180.0, 180.0)] * 2
     assert [row.pose_reason for row in rows] == ["no F", "F has no pose"]
 
@@ -122,8 +121,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_rows_hold_homographies_and_corner_errors(runs: Path) -> None:
-    dataset = load("hpatches", root=runs / "hpatches", short_side=200)
-    pairs = {pair.identity: pair for pair in dataset}
+    pairs = {pair.identity: pair for pair in load("hpatches", root=runs / "hpatches", short_side=200)}
     rows = RunFolder.load(runs / "runs/a").read().to_pylist()
     assert len(rows) == 10
     for row in rows:
@@ -333,8 +331,7 @@ def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
 def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
     pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(PAIR_TYPES)]
-    lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
-    together = rows([*pairs, lost], word)
+    together = rows([*pairs, dataclasses.replace(pairs[0], identity="lost", problem="no image")], word)
     assert [row.pair_type for row in together] == [*PAIR_TYPES, None]
     assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in PAIR_TYPES), None]
     for each, row in zip(pairs, together, strict=False):

@@ -7,8 +7,7 @@ from fmtorch.features import rotate_frames, upright_frames
 
 
 def texture(seed: int, h: int = 160, w: int = 200, sigma: float = 2.5) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=(h, w))
-    smooth = cv2.GaussianBlur(noise, (0, 0), sigma)
+    smooth = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(h, w)), (0, 0), sigma)
     return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
 
 

@@ -49,8 +49,7 @@ def test_a_call_is_detection_and_description() -> None:
     assert torch.equal(found.scores, scores)
     assert torch.equal(found.descriptors, extract.describe(image, lafs))
     # A descriptor does not depend on its neighbours; the image is described as its grey levels.
-    alone = extract.describe(image, lafs[5:6])
-    torch.testing.assert_close(alone, found.descriptors[5:6], atol=1e-5, rtol=0)
+    torch.testing.assert_close(extract.describe(image, lafs[5:6]), found.descriptors[5:6], atol=1e-5, rtol=0)
     assert same(extract(np.stack([image] * 3, -1)), found)
 
 

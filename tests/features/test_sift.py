@@ -159,8 +159,7 @@ def test_neighbours_are_invisible() -> None:
 def test_small_images_continue_at_their_border(shape: tuple[int, int]) -> None:
     flat = np.full(shape, 51, np.uint8)
     lafs = features.upright_frames(torch.tensor([[0.0, 0.0], [3.0, 2.0]]), torch.tensor([1.0, 40.0]))
-    patches = features.ImagePyramid(flat).extract(lafs)
-    torch.testing.assert_close(patches, torch.full((2, 1, 32, 32), 0.2))
+    torch.testing.assert_close(features.ImagePyramid(flat).extract(lafs), torch.full((2, 1, 32, 32), 0.2))
 
 
 def test_equals_the_definition() -> None:
@@ -194,8 +193,7 @@ def test_unaffected_by_light_and_neighbours() -> None:
 
 
 def test_projection_keeps_the_variance() -> None:
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(3000, 128, generator=generator) * torch.linspace(2, 0.01, 128) + 1
+    x = torch.randn(3000, 128, generator=torch.Generator().manual_seed(0)) * torch.linspace(2, 0.01, 128) + 1
     mean, basis = features.learn_projection(x, 20)
     torch.testing.assert_close(mean, x.mean(0), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(basis.T @ basis, torch.eye(20), atol=1e-5, rtol=0)

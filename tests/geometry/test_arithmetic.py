@@ -137,8 +137,7 @@ def test_component_sum(n, dim):
 
 
 def test_small_matrices_as_by_numpy() -> None:
-    generator = torch.Generator().manual_seed(0)
-    A, B = torch.randn(2, 4, 5, 3, 3, generator=generator, dtype=torch.float64).unbind(0)
+    A, B = torch.randn(2, 4, 5, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).unbind(0)
     a, b = (as_rows(as_components(M)) for M in (A, B))
     # Some additions of products of numbers of about 1: a few eps of absolute error.
     tight = {"rtol": 0, "atol": 1e-13}

@@ -25,8 +25,7 @@ def test_reference_opencv_and_kornia_live(batch, n):
     for i in np.ndindex(batch):
         a, b = x0[i].numpy(), x1[i].numpy()
         theirs = torch.from_numpy(cv2.findFundamentalMat(a, b, cv2.FM_8POINT)[0])
-        ones = torch.ones(1, n, dtype=torch.float64)
-        kornia = find_fundamental(x0[i][None], x1[i][None], ones)[0]
+        kornia = find_fundamental(x0[i][None], x1[i][None], torch.ones(1, n, dtype=torch.float64))[0]
         for solution, weights in ((F[i], None), (W[i], w[i].numpy()), (theirs, None), (kornia, None)):
             # M = A^T A is summed with a relative error of n eps, which moves its eigenvector by that over the gap; then
             # the undoing of the normalisation only shrinks: compared before it.

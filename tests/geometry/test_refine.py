@@ -24,8 +24,7 @@ def components(x0: np.ndarray, x1: np.ndarray) -> Tensor:
 
 
 def models(F: np.ndarray, k: int, spread: float, seed: int = 0) -> Tensor:
-    rng = np.random.default_rng(seed)
-    return torch.from_numpy(F.reshape(9, 1, 1) + rng.normal(0, spread, (9, 1, k)))
+    return torch.from_numpy(F.reshape(9, 1, 1) + np.random.default_rng(seed).normal(0, spread, (9, 1, k)))
 
 
 @pytest.mark.parametrize("loss", LOSSES)

@@ -156,8 +156,7 @@ def test_matches_that_share_a_keypoint_are_sorted_out_for_tracks(tmp_path: Path)
 
 def test_pairs_of_different_scenes_are_not_verified(tmp_path: Path) -> None:
     circle = Circle()
-    chance = dataclasses.replace(circle.pairs[0], related=False)
-    write_database(tmp_path / io.DATABASE, circle.images, [chance])
+    write_database(tmp_path / io.DATABASE, circle.images, [dataclasses.replace(circle.pairs[0], related=False)])
     with pycolmap.Database.open(tmp_path / io.DATABASE) as file:
         assert (file.num_matched_image_pairs(), file.num_verified_image_pairs()) == (1, 0)
 
@@ -403,8 +402,7 @@ def test_a_homography_of_colmap_and_back(points: tuple[Tensor, Tensor]) -> None:
     H = torch.tensor([[0.9, 0.1, 20], [-0.1, 0.9, 5], [1e-5, 0, 1]], dtype=torch.float64)
     x0 = points[0].double()
     x1 = torch.cat([x0, torch.ones(len(x0), 1)], 1) @ H.T
-    estimate = fmtorch.find_homography(x0, x1[:, :2] / x1[:, 2:])
-    geometry = fmtorch.to_colmap(estimate)
+    geometry = fmtorch.to_colmap(fmtorch.find_homography(x0, x1[:, :2] / x1[:, 2:]))
     assert geometry.F is None
     again = fmtorch.from_colmap(geometry, len(x0))
     torch.testing.assert_close(again.H / again.H[..., 2:, 2:], H[None], atol=1e-6, rtol=1e-6)

@@ -42,8 +42,7 @@ def reload(layout: str, root: Path, **options: Any) -> H5Pairs:
 
 
 def pipeline(**pruners: Any) -> Pipeline:
-    estimator = presets.build("estimator", "lmeds", hypotheses=200)
-    return Pipeline(unused, unused, pruners, estimator)
+    return Pipeline(unused, unused, pruners, presets.build("estimator", "lmeds", hypotheses=200))
 
 
 @pytest.mark.parametrize(("layout", "swapped"), [*((layout, False) for layout in writers.WRITERS), ("hloc", True)])

@@ -21,8 +21,7 @@ ROWS = st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40
 
 
 def sift_like(seed: int, n: int, d: int = 128, top: int = 60) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(0, top, (n, d), generator=generator).float()
+    return torch.randint(0, top, (n, d), generator=torch.Generator().manual_seed(seed)).float()
 
 
 def unit(seed: int, n: int, d: int = 128) -> Tensor:

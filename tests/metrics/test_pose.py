@@ -186,8 +186,7 @@ def test_corner_error_is_the_mean_over_four_corners() -> None:
     H, true = homographies(20), homographies(40)[20:]
     errors = metrics.corner_error(torch.from_numpy(H), torch.from_numpy(true), SIZE)
     moves = [mapped(a, CORNERS) - mapped(b, CORNERS) for a, b in zip(H, true, strict=True)]
-    expected = np.linalg.norm(moves, axis=2).mean(1)
-    np.testing.assert_allclose(errors, expected, rtol=1e-9)
+    np.testing.assert_allclose(errors, np.linalg.norm(moves, axis=2).mean(1), rtol=1e-9)
     scaled = metrics.corner_error(-7 * torch.from_numpy(H), torch.from_numpy(true), SIZE)
     torch.testing.assert_close(scaled, errors)
     pairs = zip(torch.from_numpy(H), torch.from_numpy(true), strict=True)

@@ -64,8 +64,7 @@ def work(pipeline, images, output, workers=None, **options) -> FolderMatches:
 
 
 def kept(output: Path) -> dict[str, dict[str, Any]]:
-    files = sorted(output.rglob("*.npz"))
-    return {path.name: dict(np.load(path)) for path in files}
+    return {path.name: dict(np.load(path)) for path in sorted(output.rglob("*.npz"))}
 
 
 def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, tmp_path):

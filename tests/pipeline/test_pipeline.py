@@ -136,8 +136,7 @@ PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches
 
 
 def built(cache: str = "off") -> Pipeline:
-    overrides = [PRUNERS, f"cache={cache}", "features.max_features=1500"]
-    return load_pipeline("sift_fmtorch", overrides=overrides)
+    return load_pipeline("sift_fmtorch", overrides=[PRUNERS, f"cache={cache}", "features.max_features=1500"])
 
 
 @pytest.fixture
@@ -184,8 +183,7 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
 
 
 def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
-    rng = np.random.default_rng(0)
-    noise = rng.integers(0, 256, (60, 80)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
     image = np.ascontiguousarray(noise[:440, :600]), np.ascontiguousarray(noise[13:453, 21:621])
     result = match(*image, pipeline=built(), longest_side=500)
     assert "refine_matches" in result.counts
@@ -196,8 +194,7 @@ def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
 
 def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) -> None:
     """They are at no keypoint any more; those of a run and of a folder are the same as without refinement."""
-    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
-    pair = dataset[0]
+    pair = data.load("fmbench", root=shared_path("data/Strecha_train"))[0]
     ends = pair.image0.path, pair.image1.path
     journals = []
     for i, overrides in enumerate(([PRUNERS], [])):

@@ -159,8 +159,7 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(overrides, sc
 
 
 def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
-    config = compose("match", ("pipeline=paper/sift_gms",))
-    stages = presets.stages(config)
+    stages = presets.stages(compose("match", ("pipeline=paper/sift_gms",)))
     assert stages["pruner"][1]["gms"]["families"] == {"wide": {"with_scale": True}}
     assert presets.composed(stages)["pruner"]["gms"]["families"] == {"wide": {"with_scale": True}}
 

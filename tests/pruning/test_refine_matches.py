@@ -147,8 +147,7 @@ def test_what_the_image_does_not_determine_stays() -> None:
     for matches_, views in (
         (border, (first, second)), (c, (flat, flat)), (c, (first, flat)), (on_edge, (edge, edge)), (c, (first, other)),
     ):  # fmt: skip
-        noise = torch.rand(1, 20) + 0.5
-        given = matches_.replace(noise=noise)
+        given = matches_.replace(noise=torch.rand(1, 20) + 0.5)
         refined = stage().with_images(given, lambda i, v=views: tuple(map(grey_pyramid, v)))
         for name in ("x1", "lafs1", "noise"):
             assert bool((getattr(refined, name) == getattr(given, name)).all()), name

@@ -34,12 +34,9 @@ def differs(v: np.ndarray, w: np.ndarray, tau: float) -> bool:
 
 
 def passes(
-    x: np.ndarray,
-    y: np.ndarray,
-    thresholds: tuple[float, float] = (0.8, 0.5),
-    neighbors: tuple[int, int] = (6, 6),
+    x: np.ndarray, y: np.ndarray, thresholds: tuple[float, float] = (0.8, 0.5), neighbors: tuple[int, int] = (6, 6),
     taus: tuple[float, float] = (0.2, 0.2),
-) -> tuple[list[int], list[list[float]]]:
+) -> tuple[list[int], list[list[float]]]:  # fmt: skip
     """The survivors of two passes, and the costs in each; in the second neighbours are sought among the survivors."""
     members, costs = list(range(len(x))), []
     for passing, (threshold, K, tau) in enumerate(zip(thresholds, neighbors, taus, strict=True)):

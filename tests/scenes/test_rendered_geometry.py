@@ -170,8 +170,7 @@ def random_world(rng: np.random.Generator) -> Surfaces:
 def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     sky = rng.integers(0, 256, (16, 32, 3), dtype=np.uint8)
-    light = Light((0.3, -0.5, 0.8), through_walls=bool(seed % 2))
-    pair = stages(random_world(rng), light, sky, monkeypatch)
+    pair = stages(random_world(rng), Light((0.3, -0.5, 0.8), through_walls=bool(seed % 2)), sky, monkeypatch)
     for _ in range(3):
         eye, target = rng.normal(0, 3, (2, 3))
         K = scenes.calibration(80.0, KERNEL_SIZE)

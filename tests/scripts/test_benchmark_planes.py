@@ -61,8 +61,7 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(tmp_path, monke
     monkeypatch.setattr(pairs, "photographs_shown", lambda dataset: shows)
     monkeypatch.setattr(pairs, "RenderedPairs", list)
     ours = [*(seen_pair(scene, 0, 1) for scene in "abcd"), seen_pair("real", 0, 1)]
-    unrelated = pairs.unrelated_pairs(ours, [[]], 100)
-    crossed = {p.scene.replace("family/", "") for p in unrelated}
+    crossed = {p.scene.replace("family/", "") for p in pairs.unrelated_pairs(ours, [[]], 100)}
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
 

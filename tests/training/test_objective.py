@@ -56,8 +56,7 @@ def test_ignored_and_masked_matches_are_invisible(seed: int) -> None:
     assert bool((gradient[ignored] == 0).all())
     garbage = torch.where(ignored, torch.nan, logit.detach())
     padded = torch.nn.functional.pad(garbage, (0, 9), value=torch.inf).requires_grad_()
-    more = torch.nn.functional.pad(label, (0, 9), value=-1)
-    other = training.classification_loss(padded, more)
+    other = training.classification_loss(padded, torch.nn.functional.pad(label, (0, 9), value=-1))
     torch.testing.assert_close(other, loss)  # exp has other last bits at other places in memory
     (padded_gradient,) = torch.autograd.grad(other, padded)
     torch.testing.assert_close(padded_gradient[:, :20], gradient)
@@ -178,8 +177,7 @@ def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
     logits = [torch.zeros(1, n, good.label.shape[1], requires_grad=True) for n in (1, 2)]
     for logit, batch in zip(logits, (good, training.collate([good, bad])), strict=True):
         weight = torch.where(batch.correspondences.mask, torch.sigmoid(logit[0]), 0)[None]
-        loss = objective(Prediction(logit, weight), batch, 0)["loss"]
-        loss.backward()
+        objective(Prediction(logit, weight), batch, 0)["loss"].backward()
     alone, together = (logit.grad for logit in logits)
     assert bool(torch.isfinite(together).all())
     assert torch.allclose(together[:, :1], alone, rtol=1e-9)

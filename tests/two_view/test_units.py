@@ -68,8 +68,7 @@ def test_kinds(kind: str, known: bool) -> None:
 
 def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
     """Rotations with K whose focal lengths are three times too long, and with measured ones but no K."""
-    pairs = [pair("rotation", seed) for seed in range(10)]
-    c = collate(pairs)
+    c = collate([pair("rotation", seed) for seed in range(10)])
     long = torch.tensor([3.0, 3.0, 1.0])
     wrong, estimate = c.replace(K0=c.K0 * long, K1=c.K1 * long), estimated(c)
     assert classify(wrong, estimate).names.count("rotation") <= 2
@@ -135,8 +134,7 @@ def test_a_mirrored_photograph_is_the_mirror_of_it() -> None:
     rng = np.random.default_rng(0)
     x = rng.uniform([0, 0], [640, 480], (80, 2))
     y = mapped(np.array([[0.9, 0.1, 20], [-0.1, 1, 5], [1e-4, 2e-4, 1]]), x) + 0.3 * rng.normal(size=(80, 2))
-    flipped = x * [1, -1]
-    both = torch.from_numpy(np.stack([x, flipped])).requires_grad_()
+    both = torch.from_numpy(np.stack([x, x * [1, -1]])).requires_grad_()
     e = fmtorch.find_homography(both, torch.from_numpy(np.stack([y, y])))
     assert e.ok.tolist() == [True, True]
     assert torch.equal(e.H[1], e.H[0] * torch.tensor([1.0, -1, 1]))

@@ -14,14 +14,9 @@ Model = Literal["fundamental", "homography"]
 
 @pairwise.computed_by("pycolmap")
 def colmap(
-    *,
-    threshold: float = 4.0,
-    confidence: Confidence = 0.999,
-    iterations: Iterations = 10000,
-    min_iterations: int = 100,
-    two_view: bool = True,
-    model: Model = "fundamental",
-) -> PairwiseEstimator:
+    *, threshold: float = 4.0, confidence: Confidence = 0.999, iterations: Iterations = 10000,
+    min_iterations: int = 100, two_view: bool = True, model: Model = "fundamental",
+) -> PairwiseEstimator:  # fmt: skip
     """COLMAP's estimators (Schoenberger & Frahm, CVPR 2016) with the defaults of its verification of matches.
 
     Where both focal lengths are known (`find_essential`, `cameras=known`) the model is an essential matrix. COLMAP's

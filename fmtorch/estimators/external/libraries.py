@@ -16,13 +16,9 @@ from fmtorch.geometry.pose import calibrated
 
 
 def opencv(
-    *,
-    method: str,
-    threshold: float = 1.0,
-    confidence: Confidence = 0.999,
-    iterations: Iterations = 2000,
+    *, method: str, threshold: float = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000,
     essential: float | None = None,
-) -> PairwiseEstimator:
+) -> PairwiseEstimator:  # fmt: skip
     """`cv2.findFundamentalMat` with one of its robust methods.
 
     USAC_PROSAC gets the matches best first, as it expects.
@@ -95,13 +91,9 @@ def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> Pairw
 
 
 def kornia_ransac(
-    *,
-    threshold: float = 1.0,
-    confidence: Confidence = 0.9999,
-    batch_size: int = 2048,
-    rounds: int = 10,
+    *, threshold: float = 1.0, confidence: Confidence = 0.9999, batch_size: int = 2048, rounds: int = 10,
     prosac: bool = True,
-) -> PairwiseEstimator:
+) -> PairwiseEstimator:  # fmt: skip
     """`kornia.geometry.RANSAC` with MSAC scores.
 
     Args:
@@ -133,23 +125,17 @@ MAX_SEED = 2**31 - 1  # of 32 bits, as DEGENSAC takes them
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
 """The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC."""
 SUPERANSAC_SAMPLERS = {
-    "uniform": "Uniform",
-    "prosac": "PROSAC",
-    "importance": "ImportanceSampler",
-    "adaptive": "ARSampler",
-}
+    "uniform": "Uniform", "prosac": "PROSAC", "importance": "ImportanceSampler", "adaptive": "ARSampler",
+}  # fmt: skip
 SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 """The names of the parts in the binding of SupeRANSAC."""
 
 
 @pairwise.computed_by("pymagsac")
 def magsac_cpp(
-    *,
-    threshold: float = 3.0,
-    confidence: Confidence = 0.9999,
-    iterations: Iterations = 10000,
+    *, threshold: float = 3.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
     sampler: str = "adaptive",
-) -> PairwiseEstimator:
+) -> PairwiseEstimator:  # fmt: skip
     """MAGSAC++ by its authors (Barath et al., CVPR 2020), which draws its own random seed.
 
     Args:
@@ -176,13 +162,9 @@ def magsac_cpp(
 
 @pairwise.computed_by("pygcransac")
 def gc_ransac_cpp(
-    *,
-    threshold: float = 1.0,
-    confidence: Confidence = 0.9999,
-    iterations: Iterations = 10000,
-    sampler: str = "prosac",
+    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000, sampler: str = "prosac",
     coherence: float = 0.975,
-) -> PairwiseEstimator:
+) -> PairwiseEstimator:  # fmt: skip
     """GC-RANSAC by its authors (Barath & Matas, CVPR 2018), which draws its own random seed.
 
     Inliers are told from its F: the flags that its binding returns (pygcransac 0.1.1) are all set, or none.
@@ -236,13 +218,9 @@ def degensac_cpp(
 
 @pairwise.computed_by("pysuperansac")
 def superansac_cpp(
-    *,
-    threshold: float = 1.5,
-    confidence: Confidence = 0.9999,
-    iterations: Iterations = 10000,
-    sampler: str = "prosac",
+    *, threshold: float = 1.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000, sampler: str = "prosac",
     score: str = "magsac",
-) -> PairwiseEstimator:
+) -> PairwiseEstimator:  # fmt: skip
     """SupeRANSAC by its author (Barath, arXiv 2506.04803), with nested RANSAC and a final iterated least-squares fit.
 
     It takes no seed. Its graph cut and progressive NAPSAC are left out: they refuse negative coordinates.
@@ -289,17 +267,10 @@ LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "trunca
 
 @pairwise.computed_by("poselib")
 def poselib(
-    *,
-    threshold: float = 1.0,
-    confidence: Confidence = 0.9999,
-    iterations: Iterations = 10000,
-    min_iterations: int = 1000,
-    prosac: bool = False,
-    loss: str | None = None,
-    loss_scale: float | None = None,
-    real_focal_check: bool = False,
-    shared_focal: bool = False,
-) -> PairwiseEstimator:
+    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    min_iterations: int = 1000, prosac: bool = False, loss: str | None = None, loss_scale: float | None = None,
+    real_focal_check: bool = False, shared_focal: bool = False,
+) -> PairwiseEstimator:  # fmt: skip
     """PoseLib's LO-RANSAC for fundamental matrices, or for two cameras of one unknown focal length (Larsson 2020).
 
     Where both focal lengths are exactly known (`find_essential`, `cameras=known`) it estimates a relative pose.
@@ -384,14 +355,9 @@ MODELS = ("fundamental", "homography")
 
 @pairwise.computed_by("fastpose")
 def fastpose(
-    *,
-    threshold: float = 1.0,
-    confidence: Confidence = 0.9999,
-    iterations: Iterations = 10000,
-    min_iterations: int = 1000,
-    model: str = "fundamental",
-    focal: str | None = None,
-) -> PairwiseEstimator:
+    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    min_iterations: int = 1000, model: str = "fundamental", focal: str | None = None,
+) -> PairwiseEstimator:  # fmt: skip
     """fastpose's LO-RANSAC, whose kernels numba compiles at the first call.
 
     Where both focal lengths are exactly known (`find_essential`, `cameras=known`) it estimates a relative pose, and

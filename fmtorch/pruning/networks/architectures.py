@@ -246,13 +246,9 @@ class DFE(OfBackbone):
     """
 
     def __init__(
-        self,
-        *,
-        widths: Sequence[int] = (64, 128, 1024, 512, 256),
-        iterations: int = 5,
-        coordinates: str = "size",
+        self, *, widths: Sequence[int] = (64, 128, 1024, 512, 256), iterations: int = 5, coordinates: str = "size",
         side: Sequence[str] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         if iterations < 1:
             raise ValueError(f"iterations={iterations}: at least one fit")
         super().__init__(coordinates, side, widths=list(widths), iterations=iterations)

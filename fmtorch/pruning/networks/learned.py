@@ -180,18 +180,10 @@ class LearnedPruner:
     """
 
     def __init__(
-        self,
-        network: nn.Module,
-        *,
-        file: str | Path | None = None,
-        runtime: str = "auto",
-        threshold: float | None = None,
-        prior: bool = True,
-        soft: bool = False,
-        temperature: float | None = None,
-        threads: int = 1,
-        command: str = COMMAND,
-    ) -> None:
+        self, network: nn.Module, *, file: str | Path | None = None, runtime: str = "auto",
+        threshold: float | None = None, prior: bool = True, soft: bool = False, temperature: float | None = None,
+        threads: int = 1, command: str = COMMAND,
+    ) -> None:  # fmt: skip
         if runtime not in RUNTIMES:
             raise ValueError(f"runtime={runtime}; there are: {', '.join(RUNTIMES)}")
         threshold, prior = (None, True) if soft else (threshold, prior)

@@ -103,8 +103,7 @@ def test_batch_norm_is_torchs_over_all_matches() -> None:
 def test_stages_judge_what_is_left(name: str) -> None:
     """Half, then a quarter of the matches; verification, of all, is not trained on."""
     torch.manual_seed(0)
-    c = collate([scene(0, count=101), scene(1, count=30)])
-    prediction = SMALL[name]().eval()(c)
+    prediction = SMALL[name]().eval()(collate([scene(0, count=101), scene(1, count=30)]))
     assert prediction.judged.sum(-1).tolist() == [[101, 30], [101, 30], [50, 15], [50, 15], [25, 7], [0, 0]]
     assert not (prediction.judged[4] & ~prediction.judged[2]).any()
     torch.testing.assert_close(prediction.weight.sum(-1), torch.ones(1, 2))
