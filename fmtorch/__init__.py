@@ -24,10 +24,29 @@ if TYPE_CHECKING:
     from fmtorch.verification.verify import Verification, verify
 
 __all__ = [
-    "Correspondences", "Estimate", "Features", "Lens", "MatchResult", "Pipeline", "PoseEstimate", "Verification",
-    "__version__", "draw_epipolar_lines", "draw_matches", "find_essential", "find_fundamental", "find_homography",
-    "from_colmap", "from_kornia", "from_lightglue", "from_opencv", "from_poselib", "match", "to_colmap", "to_poselib",
+    "Correspondences",
+    "Estimate",
+    "Features",
+    "Lens",
+    "MatchResult",
+    "Pipeline",
+    "PoseEstimate",
+    "Verification",
+    "__version__",
+    "draw_epipolar_lines",
+    "draw_matches",
+    "find_essential",
+    "find_fundamental",
+    "find_homography",
+    "from_colmap",
+    "from_kornia",
+    "from_lightglue",
+    "from_opencv",
+    "from_poselib",
+    "match",
+    "to_colmap",
+    "to_poselib",
     "verify",
-]  # fmt: skip
+]
 
 lazy_exports(__name__)

@@ -147,18 +147,27 @@ class Ransac:
     Memory: for each thread some 300 bytes a match of one pair, and 1 MB of models."""
 
     def __init__(
-        self, *, solver: str | Mapping[str, Any] | Matrices = "seven_point",
+        self,
+        *,
+        solver: str | Mapping[str, Any] | Matrices = "seven_point",
         sampler: str | Mapping[str, Any] | sampling.Sampler = "uniform",
-        score: str | Mapping[str, Any] | scores.Score = "msac", threshold: float | None = None,
-        hypotheses: Count = 2000, round: Count = 500, confidence: Probability | None = 0.9999,
+        score: str | Mapping[str, Any] | scores.Score = "msac",
+        threshold: float | None = None,
+        hypotheses: Count = 2000,
+        round: Count = 500,
+        confidence: Probability | None = 0.9999,
         preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
-        degeneracy: str | Mapping[str, Any] | None = None, pool: Count = 1,
+        degeneracy: str | Mapping[str, Any] | None = None,
+        pool: Count = 1,
         local_optimization: str | Mapping[str, Any] | refinement.LocalOptimization | None = None,
         refine: refinement.Refine | Mapping[str, Any] | None = None,
-        select: refinement.Select | Mapping[str, Any] | None = None, focal: Focal | Mapping[str, Any] | None = None,
-        inliers: str | Mapping[str, Any] | InlierRule = "threshold", inlier_threshold: float | None = None,
-        final: str | Mapping[str, Any] | NoFit = "least_squares", refit_inliers: bool = True,
-    ) -> None:  # fmt: skip
+        select: refinement.Select | Mapping[str, Any] | None = None,
+        focal: Focal | Mapping[str, Any] | None = None,
+        inliers: str | Mapping[str, Any] | InlierRule = "threshold",
+        inlier_threshold: float | None = None,
+        final: str | Mapping[str, Any] | NoFit = "least_squares",
+        refit_inliers: bool = True,
+    ) -> None:
         expect_options(Ransac, {name: value for name, value in locals().items() if name != "self"}, "")
         stops = confidence is not None
         threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
