@@ -98,7 +98,8 @@ def expect_options(
     missing = [n for n in named if known[n].default is inspect.Parameter.empty and n not in {*values, *given}]
     missing += [str(name) for name, value in values.items() if isinstance(value, str) and value == "???"]
     if missing:
-        raise ValueError(f"{where}: {', '.join(missing)} is missing")
+        hint = "" if isinstance(target, type) else ". A function is called once, with the options, and returns the part"
+        raise ValueError(f"{where}: {', '.join(missing)} is missing{hint}")
     annotations = resolved(target)
     for key, value in values.items():
         annotation = annotations.get(str(key), Any)

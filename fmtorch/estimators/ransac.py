@@ -391,8 +391,8 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (  # of an estimator of fundamental 
     inliers.share_within, merge, scores.saturated_cells, scores.pack, focal_search.posteriors,
     focal_search.distinct_models, focal_search.same_model,
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
-    posterior.centre, posterior.translate, with_focals.gain_without_prior, with_focals.refine_with_prior,
-    with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
+    posterior.centre, posterior.translate, posterior.beside_rotations, with_focals.gain_without_prior,
+    with_focals.refine_with_prior, with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
     posterior.minimise, lens_search.summed_with_lenses, lens_search.minimise_with_lenses,
 )  # fmt: skip
 

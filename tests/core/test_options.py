@@ -97,6 +97,7 @@ class Wide:
     [
         (Wide, {"threshold": "x"}, "here.threshold=x; it must be a number"),
         (Wide, {}, "here: threshold is missing"),
+        (lambda x: x, {}, "here: x is missing. A function is called once, with the options, and returns the part"),
         (Wide, {"threshold": 1, "level": 2}, "here: no option level; there are: levels, "),
         (Wide, {"threshold": 1, "first": {"matches": "all"}}, "here.first.matches=all; it must be a whole number"),
         (Wide, {"threshold": 1, "first": {"match": 3}}, "here.first: no option match; there are: matches, scale"),
