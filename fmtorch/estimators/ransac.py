@@ -392,8 +392,9 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (  # of an estimator of fundamental 
     focal_search.distinct_models, focal_search.same_model,
     # Cameras and fits; `evaluate` is called by `minimise` and `refine`
     posterior.centre, posterior.translate, posterior.beside_rotations, with_focals.gain_without_prior,
-    with_focals.refine_with_prior, with_focals.cheirality, most_significant, posterior.nearest_cameras, levenberg_marquardt.evaluate, refine_kernel,
-    posterior.minimise, lens_search.summed_with_lenses, lens_search.minimise_with_lenses,
+    with_focals.refine_with_prior, with_focals.cheirality, most_significant, posterior.nearest_cameras,
+    levenberg_marquardt.evaluate, refine_kernel, posterior.minimise, lens_search.summed_with_lenses,
+    lens_search.minimise_with_lenses,
 )  # fmt: skip
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
