@@ -170,9 +170,12 @@ class FocalSearch:
 def outlying(fit: Fit | None, inliers: Array | None, pair: Pair) -> Array | None:
     """The matches (n,) of calibrated cameras at little parallax that have OUTLYING times that of nine tenths of the
     inliers (n,), None where no inlier has."""
-    if fit is None or inliers is None or fit.cameras is None or pair.calibration is None or not pair.calibration.exact:
+    if fit is None or fit.cameras is None or inliers is None or not inliers.any():
+        return None
+    if pair.calibration is None or not pair.calibration.exact:
         return None
     q = parallax(fit.cameras, pair)
+    q = q if pair.stretch is None else q / pair.stretch
     usual = float(np.sort(q[inliers])[np.count_nonzero(inliers) * 9 // 10])
     beyond: Array = q > OUTLYING * usual
     return beyond if usual * math.sqrt(fit.precision) < STILL and (beyond & inliers).any() else None
