@@ -58,8 +58,7 @@ def matched(arguments: argparse.Namespace) -> list[Pair]:
         if c is not None and int(c.count()) >= MIN_MATCHES:
             distance = sampson(torch.from_numpy(item.pair.F)[None], c.x0.double(), c.x1.double())[0]
             rendered = item.pair.family in FAMILIES  # whose scenes have but a few pairs each
-            scene = item.pair.family if rendered else item.pair.scene
-            own.append(Pair(scene, c, (distance < INLIER).numpy()))
+            own.append(Pair(item.pair.family if rendered else item.pair.scene, c, (distance < INLIER).numpy()))
     return own
 
 

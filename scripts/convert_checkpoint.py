@@ -80,8 +80,7 @@ def main() -> None:
                 checkpoint = torch.load(arguments.checkpoint, map_location="cpu", weights_only=True)
         except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
             raise ValueError(f"{arguments.checkpoint} holds no tensors: {str(error).splitlines()[0]}") from None
-        weights = checkpoint.get("state_dict", checkpoint)
-        network.load_state_dict(authors_state(arguments.network, network, weights))
+        network.load_state_dict(authors_state(arguments.network, network, checkpoint.get("state_dict", checkpoint)))
         save_weights(network, arguments.out, notes={"origin": f"{arguments.checkpoint.name} of the authors' code"})
         said = f"{arguments.out}: {network_class.__name__}({network.extra_repr()}); log-odds are not calibrated"
         console.print(said, markup=False)

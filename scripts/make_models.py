@@ -68,16 +68,14 @@ def codebooks(arguments: argparse.Namespace) -> None:
         extract = load_pipeline("sift_ratio", overrides=options).extractor
         selected = itertools.islice(images(arguments), 0, None, arguments.every)
         parts = [local_descriptors(extract(image).descriptors, kind) for image in selected]
-        book = learned(parts, CENTERS, DIMENSIONS)
-        write(arguments.output / f"vlad_{name}.npz", book._asdict(), parts)
+        write(arguments.output / f"vlad_{name}.npz", learned(parts, CENTERS, DIMENSIONS)._asdict(), parts)
 
 
 def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
     """Centres by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
     descriptors = torch.cat(parts)
     mean, basis = learn_projection(descriptors, dimensions)
-    projected = ((descriptors - mean) @ basis).numpy()
-    nearest, _ = kmeans2(projected, centers, iter=ITERATIONS, minit="++", seed=0)
+    nearest, _ = kmeans2(((descriptors - mean) @ basis).numpy(), centers, iter=ITERATIONS, minit="++", seed=0)
     return Codebook(mean, basis, torch.from_numpy(nearest))
 
 

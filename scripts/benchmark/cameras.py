@@ -95,7 +95,6 @@ def has_cameras(pair: ImagePair) -> bool:
 
 
 def focals_of(*calibrations: Array | None) -> Array:
-    """The focal lengths in pixels, geometric means of those along x and y; NaN where unknown."""
     return np.array([np.nan if K is None else np.sqrt(K[0, 0] * K[1, 1]) for K in calibrations])
 
 
@@ -310,7 +309,6 @@ def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> S
 
 
 def _points_alone(outcome: Outcome, seed: int) -> Outcome:
-    """A pair as PoseBench has it."""
     c = outcome.correspondences
     plain = None if c is None else Correspondences(c.x0, c.x1, c.mask, size0=c.size0, size1=c.size1, key=c.key)
     return dataclasses.replace(outcome, correspondences=plain)

@@ -96,7 +96,6 @@ def parallax(case: Case) -> float:
 
 
 def on_plane(case: Case) -> Bool[Tensor, " n"]:
-    """The right matches of the homography that holds for most of them, (n,)."""
     ends = (x[0, case.right].double() for x in (case.c.x0, case.c.x1))
     estimate = find_homography(*ends, inlier_threshold=PLANE_PX, key=case.pair.key)
     return torch.zeros_like(case.right).masked_scatter(case.right, estimate.inliers[0])
@@ -267,7 +266,6 @@ def bent(pair: ImagePair, c: Correspondences, lens: float) -> tuple[ImagePair, C
 
 
 def sizes_of(c: Correspondences) -> list[list[float]]:
-    """Height and width of both images of a batch of one."""
     assert c.size0 is not None
     assert c.size1 is not None
     return [c.size0[0].tolist(), c.size1[0].tolist()]

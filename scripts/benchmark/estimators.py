@@ -126,7 +126,6 @@ def read_curves(lines: Sequence[str]) -> list[Curve]:
 
 
 def area_and_cost(results: Results, spec: str) -> tuple[float, float]:
-    """AUC@0.05 in percent and milliseconds, averaged over the families."""
     families = results.by_family(results.pairs()).values()
     area = np.mean([results.percent(spec, own, "AUC@0.05") for own in families])
     return float(area), float(np.mean([results.get(spec, own)("ms").mean() for own in families]))

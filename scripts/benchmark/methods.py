@@ -36,7 +36,6 @@ NO_STAGES: Mapping[str, Pruner] = {}
 
 
 def specs_of(words: Sequence[str], file: Path | None) -> list[str]:
-    """The methods that are named, and those of a file. Raises SystemExit for none."""
     if specs := [*words, *(read_specs(file) if file else [])]:
         return specs
     raise SystemExit("name at least one method, or a file of --specs")

@@ -51,16 +51,13 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
 
 
 def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
-    """The data sets that these options name, before any limit."""
-    layout = "cameras" if arguments.all_pairs else "fmbench"
-    sets = [data.load(layout, root=root) for root in arguments.root]
+    sets = [data.load("cameras" if arguments.all_pairs else "fmbench", root=root) for root in arguments.root]
     if arguments.rendered:
         sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
     return sets
 
 
 def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
-    """The pairs of these data sets, those that share images one after another."""
     return select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
 
 
@@ -80,7 +77,6 @@ def rows_of(arguments: argparse.Namespace, measured: Callable[[Kept], list[Row]]
 def front_of(
     features: str, pruners: Iterable[str], cache: str = "off", memory: int = 64, matcher: str = "nearest"
 ) -> Pipeline:
-    """What makes the matches that all methods get."""
     stages = {word: methods.build("pruner", word) for word in pruners}
     extractor = cached(presets.build("features", features), cache)
     return Pipeline(extractor, methods.build("matcher", matcher), stages, no_estimator, memory=memory)

@@ -95,7 +95,6 @@ def run(settings: Settings, arguments: argparse.Namespace) -> None:
 
 
 def selected_pipelines(known: Mapping[str, str], wanted: Sequence[str]) -> dict[str, str]:
-    """The pipelines that are asked for, by name. Raises SystemExit for one that is none."""
     selected: dict[str, str] = {}
     for word in wanted:
         name, equals, words = (part.strip() for part in word.partition(" = "))
@@ -162,7 +161,6 @@ def _papers(settings: Settings, family: str, name: str) -> dict[str, str]:
 
 
 def differences_sheet(results: Results, settings: Settings) -> Sheet:
-    """What one pipeline has more than another on the pairs that both have, of each set."""
     stated = [tuple(two) for two in settings.get("differences", []) if set(two) <= set(results.methods)]
     labelled = [(name, base) for name in results.methods for base in results.methods if name.startswith(f"{base} ")]
     records = []

@@ -182,7 +182,6 @@ def by_colmap(threshold: float, c: Correspondences) -> str:
 
 
 def kinds_sheet(rows: Sequence[Row]) -> Sheet:
-    """How many pairs of each group each method calls what."""
     records: list[Record] = []
     for (method, group, truth), own in grouped(rows, "method", "group", "truth").items():
         kinds = [row["kind"] for row in own]
@@ -232,7 +231,6 @@ def time_line(matches: Sequence[Correspondences]) -> str:
 
 
 def paths_of(arguments: argparse.Namespace) -> list[Path]:
-    """The photographs that are asked for. Raises SystemExit for fewer than two."""
     paths = sorted(path for path in arguments.photographs.iterdir() if path.suffix in (".jpg", ".png"))
     paths = paths[(0 if arguments.tuning else 1) :: 2][: arguments.limit]
     if len(paths) < 2:

@@ -18,11 +18,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 import fmtorch
+from fmtorch.data import Lens, undistorted_points
 from fmtorch.data.pairs import Camera, relative_pose
 from fmtorch.io.colmap import imported, remove_database
 from fmtorch.metrics import pose_auc, pose_error
@@ -59,6 +61,7 @@ def add_arguments(commands: Any) -> None:
     parser = add_command(commands, "known_models", run_known_models, KNOWN_MODELS)
     parser.add_argument("--root", type=Path, nargs="+", required=True, help="folders of scenes in FM-Bench's layout")
     parser.add_argument("--folder", type=Path, default=Path("models"), help="of the models; those there are kept")
+    parser.add_argument("--lens", nargs="+", help="bends photographs: a model of fx, fy, cx, cy, ..., its coefficients")
 
 
 class Scene(NamedTuple):
@@ -332,11 +335,26 @@ def run_known_models(arguments: argparse.Namespace) -> None:
             given = posed(scene, database)
             model = pycolmap.triangulate_points(given, database, scene.images, Path(temporary), options=options)
             (folder / "sparse").mkdir(parents=True)
-            model.write_text(folder / "sparse")
             shutil.copytree(scene.images, folder / "images")
+            if arguments.lens:
+                bend(model, folder / "images", arguments.lens[0], *map(float, arguments.lens[1:]))
+            model.write_text(folder / "sparse")
             folder.rename(target)
         seen = model.compute_mean_observations_per_reg_image()
         print(f"{target}: {model.num_points3D()} points, {seen:.0f} seen in an image")
+
+
+def bend(model: Any, images: Path, kind: str, *coefficients: float) -> None:
+    """Photographs as cameras of this model and these coefficients take them, and such cameras for pinholes."""
+    for camera in model.cameras.values():
+        camera.model, camera.params = kind, [*camera.params, *coefficients]
+    for image in model.images.values():
+        fx, fy, cx, cy = image.camera.params[:4]
+        lens, path = Lens(fx, fy, cx - ORIGIN, cy - ORIGIN, kind, coefficients), str(images / image.name)
+        pixels: Any = cv2.imread(path)
+        grid = np.stack(np.meshgrid(*(np.arange(float(n)) for n in pixels.shape[1::-1])), -1)
+        x, y = undistorted_points(lens, grid.reshape(-1, 2)).T.reshape(2, *grid.shape[:2]).astype(np.float32)
+        cv2.imwrite(path, cv2.remap(pixels, x, y, cv2.INTER_CUBIC))
 
 
 def posed(scene: Scene, database: Path) -> Any:

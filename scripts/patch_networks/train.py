@@ -166,8 +166,7 @@ def opened_stores(config: DictConfig) -> list[PatchStore]:
             photographs += stores.package_photographs() if config.package_images else []
             chosen = stores.split(photographs, given.held_out)[side]
             console.print(f"cutting patches of {len(chosen)} photographs into {folder}")
-            seed = patches.seed + side
-            stores.build_store(folder, chosen, cutting_of(config), seed, patches.workers)
+            stores.build_store(folder, chosen, cutting_of(config), patches.seed + side, patches.workers)
         opened.append(PatchStore.open(folder))
     return opened
 
