@@ -87,7 +87,8 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
 
     monkeypatch.setattr(Kernel, "__call__", recorded)
     estimator = presets.build("estimator", "fmtorch")
-    for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
+    calibrated = scene(0, 300).replace(focal=torch.tensor([[[800.0, 0.0], [800.0, 0.0]]]))
+    for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]])), calibrated):
         estimator(c)
     assert with_callees(called) == set(estimator.kernels)
     for framed, name in ((False, "position_consistency"), (True, "frame_consistency")):
