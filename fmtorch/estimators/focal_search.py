@@ -174,11 +174,12 @@ def outlying(fit: Fit | None, inliers: Array | None, pair: Pair) -> Array | None
         return None
     if pair.calibration is None or not pair.calibration.exact:
         return None
-    q = parallax(fit.cameras, pair)
-    q = q if pair.stretch is None else q / pair.stretch
-    usual = float(np.sort(q[inliers])[np.count_nonzero(inliers) * 9 // 10])
-    beyond: Array = q > OUTLYING * usual
-    return beyond if usual * math.sqrt(fit.precision) < STILL and (beyond & inliers).any() else None
+    both = parallax(fit.cameras, pair)
+    both = both if pair.stretch is None else both / pair.stretch
+    usual = np.sort(both[:, inliers], axis=1)[:, np.count_nonzero(inliers) * 9 // 10]
+    nearer = int(usual.argmin())
+    beyond: Array = both[nearer] > OUTLYING * usual[nearer]
+    return beyond if usual[nearer] * math.sqrt(fit.precision) < STILL and (beyond & inliers).any() else None
 
 
 @kernel(holds_gil=True)

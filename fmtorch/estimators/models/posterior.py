@@ -105,13 +105,11 @@ def focal_precision(focals: Array, pair: Pair) -> Array:
 
 
 def parallax(cameras: Cameras, pair: Pair) -> Array:
-    """How far points (n,) of image 1 are from where points at infinity would be, in the unit of the points: by that one
-    of the two rotations of an essential matrix, the cameras of one candidate, to which they are nearer."""
-    out = np.empty((2, pair.count))
-    beside_rotations(
-        cameras.axes[0], focals_px(cameras, pair) / pair.pixels_per_unit, images_of(pair).offset, pair.points, out
-    )
-    return min(out, key=np.median)
+    """How far points of image 1 are from where points at infinity would be, in the unit of the points: by either of the
+    rotations of an essential matrix, the cameras of one candidate, (2, n)."""
+    out, depth = np.empty((2, pair.count)), focals_px(cameras, pair) / pair.pixels_per_unit
+    beside_rotations(cameras.axes[0], depth, images_of(pair).offset, pair.points, out)
+    return out
 
 
 def centred(pair: Pair, scale_px: float = 1.0) -> Weighted:
