@@ -38,7 +38,7 @@ from fmtorch.jobs.execution import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 SEARCHED = 2048  # right matches that suffice for a search
-ACCIDENTAL_SHARE = 0.01  # of wrong matches, which lie beside their epipolar lines
+ACCIDENTAL, ACCIDENTAL_SHARE = 3, 0.01  # wrong matches that lie beside their epipolar lines: so many, and of all
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 Probability = Annotated[float, Within(0, 1, exclusive=True)]
@@ -274,7 +274,7 @@ class Ransac:
         second = self._fitted(pair, *self.selected(searched(pair.ignoring(outlying))))
         if second.inliers is None:
             return first
-        accidental = 2 + ACCIDENTAL_SHARE * (pair.count - np.count_nonzero(first.inliers))
+        accidental = ACCIDENTAL + ACCIDENTAL_SHARE * (pair.count - np.count_nonzero(first.inliers))
         better = np.count_nonzero(outlying & first.inliers & ~second.inliers) <= accidental
         return (second if better else first)._replace(samples=first.samples + second.samples)
 
