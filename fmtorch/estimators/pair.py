@@ -148,6 +148,15 @@ class Pair:
         table[4, wrong] = table[MATCH_WEIGHT, wrong] = 0
         return self.with_table(table, (True, *self.known[1:]), self.lens)
 
+    def reduced(self, times: int) -> "Pair":
+        """The pair as it were if its photographs were reduced so many times: distances are as many pixels fewer."""
+        table = self.table.copy()
+        table[5] /= times
+        return Pair(
+            table, self.known, self.bucket, self.pixels_per_unit / times, self.key, self.seed, self.centre / times,
+            self.sizes / times, self.residual, self.calibration, self.images, self.lens,
+        )  # fmt: skip
+
     def with_table(self, table: Array, known: tuple[bool, bool, bool], lens: Lens | None) -> "Pair":
         """The same pair with another table."""
         return Pair(

@@ -139,6 +139,8 @@ class Ransac:
             `unweighted_least_squares` (all inliers alike), `gauss_newton` (one step), `adaptive` (refined at the pair's
             own noise, with the prior on focal lengths unless the matches contradict it) or `none`.
         refit_inliers: recompute the inliers after the final fit.
+        coarsest: a pair whose matches are coarser than the distances in pixels are for is estimated again with twice,
+            four times ... these, at most so many times; its inliers are those of the inlier threshold, as ever.
 
     Raises:
         ValueError: for an unknown part or option, and for one that would have no effect, such as a threshold where
@@ -167,6 +169,7 @@ class Ransac:
         inlier_threshold: float | None = None,
         final: str | Mapping[str, Any] | NoFit = "least_squares",
         refit_inliers: bool = True,
+        coarsest: Count = 1,
     ) -> None:
         expect_options(Ransac, {name: value for name, value in locals().items() if name != "self"}, "")
         stops = confidence is not None
@@ -176,7 +179,7 @@ class Ransac:
         self.score: scores.Score = part("score", score, threshold=threshold)
         self.inlier_rule: InlierRule = part("inliers", inliers, threshold=inlier_px)
         self.final: NoFit = part("final", final)
-        self.refit_inliers = refit_inliers
+        self.refit_inliers, self.coarsest = refit_inliers, coarsest
         stop = None if confidence is None else StoppingRule(confidence, inlier_px, self.sampler)
         preselection = Preselection(self.score, stage(preselect, Preselect))
         check = part("degeneracy", degeneracy, score=self.score)
@@ -259,6 +262,23 @@ class Ransac:
             np.sqrt(pair.match_weight, out=pair.match_weight)
         if pair.lens is not None:
             return self._with_lenses(pair, pair.lens)
+        solution, times = self._of_one_scale(pair), 1
+        while times < self.coarsest and solution.fit is not None:
+            F, samples = solution.fit.F, solution.samples
+            if not inliers.coarse(squared_in_noises(F, across_lines(pair.reduced(times), F))):
+                break
+            times *= 2
+            coarser = self._of_one_scale(pair.reduced(times))
+            if coarser.fit is None:
+                break
+            solution = coarser._replace(samples=samples + coarser.samples)
+        if times == 1 or solution.fit is None:
+            return solution
+        seen, F = across_lines(pair, solution.fit.F), solution.fit.F
+        return solution._replace(inliers=self.inliers(F, seen), pair=None if pair.stretch is None else seen)
+
+    def _of_one_scale(self, pair: Pair) -> Solution:
+        """The same of pinholes, at the distances in pixels of the options."""
         solution = self._of_pinholes(pair)
         if self.focal is None or solution.fit is None or not pair.sizes_known:
             return solution

@@ -17,6 +17,7 @@ from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x3, F8x1, F8x3, for_each_pai
 _SQUARINGS = 10
 SCORE_POWER = 0.75  # of the odds of a score, by square roots
 _MIN_SCORE = 1e-3  # and its distance from 1
+MIN_CORRELATION = 0.1  # of scores that say something, with the evidence; LightGlue's mostly have 0.2 to 0.5
 _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the logistic function here is 6e-6 off 1 there
 
 
@@ -63,7 +64,13 @@ def calibrated_by_score(evidence: F4x1, score: F4x1, mask: B1x1, numbers: F8x1, 
             alone[i] = logistic(min(max(numbers[0] + numbers[1] * evidence[i], -_LARGEST), _LARGEST))
             scored[i] = odds / (odds + 1)
             expected, agreed, count = expected + scored[i], agreed + alone[i], count + 1
-    probable = abs(expected - agreed) < numbers[3] * count
+    covariance, scores, evidences = 0.0, 0.0, 0.0
+    for i in range(n):
+        if mask[i]:
+            s, e = scored[i] - expected / count, alone[i] - agreed / count
+            covariance, scores, evidences = covariance + s * e, scores + s * s, evidences + e * e
+    correlated = covariance > MIN_CORRELATION * math.sqrt(scores * evidences) + 1e-9 * count
+    probable = correlated and abs(expected - agreed) < numbers[3] * count
     for i in range(n):
         out[i] = (scored[i] if probable else alone[i]) if mask[i] else 0.0
     out[n] = 1.0 if probable else 0.0
@@ -76,7 +83,7 @@ class Calibration:
     none; without it their prior stays as it is. with_score: {constant, tolerance}, where they have a matcher's score s
     and no ratio: ``logistic(constant + SCORE_POWER log(s / (1 - s)))``. That holds of scores that are probabilities, as
     LightGlue's, which has seen all matches. Others are ignored: a pair's scores are taken for such only if the mean of
-    that is within the tolerance of the mean P(inlier) by `alone`.
+    that is within the tolerance of the mean P(inlier) by `alone`, and the two are correlated.
     `scripts/calibrate_priors.py` fits the numbers of `with_ratio` and `alone`."""
 
     with_ratio: Mapping[str, float]

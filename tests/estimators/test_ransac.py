@@ -318,3 +318,14 @@ def test_of_many_likely_matches_a_part_is_searched_and_all_are_fitted(monkeypatc
     assert torch.equal(estimator(few_likely).F, of_few.F)
     assert not torch.equal(whole.F, part.F)
     assert all(_true_inlier_error(estimate.F[0], 3, 6000) < 0.02 for estimate in (whole, part))
+
+
+def test_coarse_matches_are_fitted_at_their_own_noise() -> None:
+    adapted, fixed = built("estimator", "fmtorch"), built("estimator", "fmtorch:coarsest=1")
+    coarse, sharp = (collate([scene(i, 200, outliers=0.3, noise=n) for i in range(8)]) for n in (3.0, 0.3))
+    F, G = adapted(coarse), fixed(coarse)
+    better, worse = (np.median([_true_inlier_error(e.F[i], i, 200) for i in range(8)]) for e in (F, G))
+    assert better < 0.7 * worse
+    x0, x1 = coarse.x0[0].double().numpy(), coarse.x1[0].double().numpy()
+    assert np.array_equal(F.inliers[0].numpy(), np.abs(sampson(F.F[0].numpy(), x0, x1)) <= 1.5)
+    assert torch.equal(adapted(sharp).F, fixed(sharp).F)

@@ -50,21 +50,23 @@ def by_score(evidence: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
     """P(inlier) of the matches of one pair, as the docstring of `Calibration` has it."""
     alone = torch.sigmoid(-2 + 4 * evidence.double())
     scored = torch.sigmoid(1.5 + 0.75 * torch.logit(score.double().clamp(1e-3, 1 - 1e-3)))
-    return scored if (scored.mean() - alone.mean()).abs() < 0.25 else alone
+    correlation = torch.corrcoef(torch.stack([scored, alone]))[0, 1]  # NaN of equal scores
+    return scored if (scored.mean() - alone.mean()).abs() < 0.25 and correlation > 0.1 else alone
 
 
-def test_scores_are_taken_for_probabilities_only_where_their_mean_is_that_of_the_agreement() -> None:
+def test_scores_are_taken_for_probabilities_only_where_they_are_like_the_agreement() -> None:
     generator = torch.Generator().manual_seed(0)
-    evidence, mask = torch.rand(3, 40, generator=generator), torch.ones(3, 40, dtype=torch.bool)
-    score = torch.stack([(evidence[0] / 2).clamp(0.01), torch.linspace(0, 1, 40), torch.full((40,), 1e-4)])
+    evidence, mask = torch.rand(4, 40, generator=generator), torch.ones(4, 40, dtype=torch.bool)
+    few, equal = evidence[2] / 100, torch.full((40,), 0.2)
+    score = torch.stack([(evidence[0] / 2).clamp(0.01), torch.linspace(0, 1, 40), few, equal])
     mask[1, 25:] = False
     c = scene(0, 40).replace(prior=None, ratio=None)
-    c = Correspondences(c.x0.expand(3, -1, -1), c.x1.expand(3, -1, -1), mask, score=torch.where(mask, score, torch.nan))
-    expected = torch.stack([by_score(evidence[i], score[i]) for i in (0, 2)])
+    c = Correspondences(c.x0.expand(4, -1, -1), c.x1.expand(4, -1, -1), mask, score=torch.where(mask, score, torch.nan))
+    expected = torch.stack([by_score(evidence[i], score[i]) for i in (0, 2, 3)])
     prior = SCORED(c, evidence).prior
-    torch.testing.assert_close(prior[[0, 2]], expected.float(), atol=0.005, rtol=0)  # of `logistic`
+    torch.testing.assert_close(prior[[0, 2, 3]], expected.float(), atol=0.005, rtol=0)  # of `logistic`
     torch.testing.assert_close(prior[1, :25], by_score(evidence[1, :25], score[1, :25]).float(), atol=0.005, rtol=0)
-    assert torch.equal(prior[2], logistic(-2 + 4 * evidence[2])), "such scores are ignored"
+    assert torch.equal(prior[2:], logistic(-2 + 4 * evidence[2:])), "scores of another mean, or all equal, are ignored"
     assert not torch.allclose(prior[0], logistic(-2 + 4 * evidence[0]), atol=0.05)
     assert not prior[1, 25:].any()
     assert torch.equal(SCORED(c[1:2], evidence[1:2]).prior, prior[1:2]), "neighbours are invisible"
@@ -76,7 +78,7 @@ def test_scores_are_taken_for_probabilities_only_where_their_mean_is_that_of_the
 def test_gradients_of_a_calibrated_score(share: float) -> None:
     c = scene(0, 12).replace(prior=None, ratio=None)
     evidence = torch.rand(1, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
-    score = torch.full((1, 12), share, dtype=torch.float64, requires_grad=True)
+    score = (share * evidence.detach()).requires_grad_()
     wanted = score if share == 0.2 else evidence
     (slope,) = torch.autograd.grad(SCORED(c.replace(score=score), evidence).prior.sum(), wanted)
     (expected,) = torch.autograd.grad(by_score(evidence[0], score[0]).sum(), wanted)
