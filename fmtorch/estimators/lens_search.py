@@ -17,8 +17,9 @@ from fmtorch.estimators.models import posterior
 from fmtorch.estimators.models.focal_prior import MIN_DEVIATION, focal_cost
 from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
+from fmtorch.estimators.models.with_focals import gain_without_prior
 from fmtorch.estimators.pair import Lens, Pair, squared
-from fmtorch.estimators.refinement import FOCAL_TOLERANCE, Fit, LensFit
+from fmtorch.estimators.refinement import FOCAL_TOLERANCE, PRIOR_CONFLICT_GAIN, Fit, LensFit, measured
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, minimiser, rows_of, summation
 from fmtorch.geometry.matrices import assign
@@ -335,7 +336,7 @@ def lenses_of(pair: Pair, search: FocalSearch) -> Array:
     if unknown.all():
         none = np.zeros(2)
         pinholes = [_from(fit._replace(lens=none), STRAIGHT, pair, START_SCALE_PX, START_ITERATIONS) for fit in fits]
-        if not best.evidence > _best(pinholes, STRAIGHT, pair, scale).evidence:
+        if not best.evidence > _straight_evidence(_best(pinholes, STRAIGHT, pair, scale), pair):
             return mean
     return best.lens
 
@@ -368,6 +369,16 @@ def lens_fit(lens: Array, cameras: Cameras, pair: Pair, inliers: Array) -> Fit:
     (fit,) = fit_with_lenses(cameras, lens[None], lens_prior(pair.lens), pair, scale, ITERATIONS)
     counted = (squared_px(fit.F, fit.lens, pair) <= np.square(scale * pair.noises)).astype(np.float64)
     return Fit(fit.F, fit.F, counted, fit.cameras, _precision(scale, pair), lens=fit)
+
+
+def _straight_evidence(fit: LensFit, pair: Pair) -> float:
+    """That of pinholes, or of a fundamental matrix without plausible cameras, as of crops, if that is greater."""
+    if measured(pair):
+        return fit.evidence
+    gain, cameras = np.empty(1), slice(LENS)
+    derivatives = np.ascontiguousarray(fit.hessian[cameras, cameras]), fit.gradient[cameras]
+    gain_without_prior(*derivatives, fit.cameras.focal[0], images_of(pair).prior, gain)
+    return fit.evidence + max(0.0, float(gain[0]) - PRIOR_CONFLICT_GAIN)
 
 
 def _precision(scale_px: float, pair: Pair) -> float:
@@ -407,7 +418,8 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
         return math.nan
     fits = [near, *(refined(pinholes._replace(lens=np.array(start)), SHARED) for start in STARTS[1:])]
     scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
-    best, without = _best(fits, SHARED, pair, scale), _best([refined(pinholes, STRAIGHT)], STRAIGHT, pair, scale)
+    best = _best(fits, SHARED, pair, scale)
+    without = _straight_evidence(_best([refined(pinholes, STRAIGHT)], STRAIGHT, pair, scale), pair)
     lens, deviation = float(best.lens[0]), float(best.deviation[0])
     clear = abs(lens) > max(SUGGESTED_LENS, SUGGESTED_DEVIATIONS * deviation)
-    return lens if clear and best.evidence - without.evidence > SUGGESTED_GAIN else math.nan
+    return lens if clear and best.evidence - without > SUGGESTED_GAIN else math.nan

@@ -55,19 +55,28 @@ class KnownCameras:
         estimate = judged(output_of(self.estimator, estimate, Estimate, square), square)
         with one_thread(c.mask.device):
             known = _with_cameras(estimate, square, images, self.covariance)
-        return known if images.map is None else known.derived(contradicted=self._contradicted(c, known, seed))
+        return known if images.map is None else self._compared(c, square, known, seed)
 
     @torch.no_grad()
-    def _contradicted(self, c: Correspondences, estimate: Estimate, seed: int) -> Bool[Tensor, " b"]:
-        """Of the pairs whose principal points may be those of other images, which have far more inliers without K."""
-        rows = _off_centre(c).nonzero()[:, 0]
-        wrong = torch.zeros_like(estimate.ok)
-        if len(rows):
-            alone = c.detach()[rows].derived(K0=None, K1=None, focal=None, shared_focal=None)
-            alone = alone if self.pruner is None else self.pruner(alone)
-            without = self.estimator(alone, seed).inliers.sum(1)
-            wrong[rows] = without > MORE * estimate.inliers[rows].sum(1) + MORE_MATCHES
-        return wrong
+    def _compared(self, c: Correspondences, square: Correspondences, known: Estimate, seed: int) -> Estimate:
+        """The estimate with which calibrations its matches contradict: of those whose principal points may be of other
+        images, or that suggest a lens, the ones of far more inliers without K than with K, and than with that lens."""
+        rows, wrong, suggested = _off_centre(c), torch.zeros_like(known.ok), known.lens_suggested
+        if suggested is not None:
+            rows |= suggested.isfinite()
+        if not bool(rows.any()):
+            return known.derived(contradicted=wrong)
+        alone = c.detach()[rows].derived(K0=None, K1=None, focal=None, shared_focal=None)
+        without = self.estimator(alone if self.pruner is None else self.pruner(alone), seed).inliers.sum(1)
+        most = known.inliers[rows].sum(1)
+        if suggested is None:
+            wrong[rows] = without > MORE * most + MORE_MATCHES
+            return known.derived(contradicted=wrong)
+        bend = suggested[rows].double().nan_to_num(0)
+        lens = torch.stack([bend, torch.zeros_like(bend)], -1)[:, None].expand(-1, 2, 2)
+        bent = self.estimator(square.detach()[rows].derived(lens=lens), seed).inliers.sum(1)
+        wrong[rows] = without > MORE * torch.maximum(most, bent) + MORE_MATCHES
+        return known.derived(contradicted=wrong, lens_suggested=torch.where(wrong, torch.nan, suggested))
 
 
 class Images(NamedTuple):
