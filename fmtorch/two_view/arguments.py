@@ -191,6 +191,8 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
         listed = isinstance(value, list | tuple | Tensor | np.ndarray) and getattr(value, "ndim", 1) > 0
         if not listed or len(cast(Any, value)) != count:
             raise ValueError(f"{name} must be a list of {count} arrays, one for each pair of x0")
+        if name != "mask" and any(missing := [entry is None for entry in cast(Any, value)]):
+            raise ValueError(f"{name} of pair {missing.index(True)} is None; give it for all pairs, or for none")
     if not count:
         return _batch(torch.zeros(0, 0, 2), torch.zeros(0, 0, 2), {})
     batch_fields = {

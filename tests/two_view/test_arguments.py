@@ -85,6 +85,10 @@ def test_one_size_is_that_of_all_pairs() -> None:
         ([np.zeros((9, 2))], [np.zeros((8, 2))], {}, "pair 0: x0 has shape .9, 2. but x1 .8, 2."),
         ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
         ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),
+        *(
+            ([np.zeros((9, 2))] * 2, [np.zeros((9, 2))] * 2, {name: [np.ones(9), None]}, f"{name} of pair 1 is None;")
+            for name in ("score", "prior", "ratio", "noise")
+        ),
         (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
         (*SCENE[:2], {"size0": (640, 480), "size1": (640, 480)}, r"size1 is \(640, 480\), but .* looks like \(w, h\)"),
         (*SCENE[:2], {"size0": (480, 640), "size1": (48, 64)}, r"size1 is \(48, 64\), but .* of x1 lie outside such"),
