@@ -37,8 +37,9 @@ PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Cor
 """The dimensions of what has an entry for each match, of one pair."""
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
+ROUNDING = 1e-6  # by which what is within [0, 1] may exceed 1
 RATIO = Rule(
-    lambda ratio: ~((ratio < 0) | (ratio > 1 + 1e-6)),
+    lambda ratio: ~((ratio < 0) | (ratio > 1 + ROUNDING)),
     "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, "
     "such as DMatch.distance, give none, or as `ratio` quotients; `score` is a confidence in [0, 1], larger is better",
 )
@@ -173,6 +174,8 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
         tensor = tensor.to(torch.int64)
     elif not declared.holds(tensor.dtype) or tensor.is_floating_point():
         tensor = tensor.to(torch.bool) if name in ("mask", "mutual") else widened(tensor)
+    if name in ("score", "prior"):  # where nothing is known nothing speaks for the match
+        tensor = torch.where(tensor > 1 + ROUNDING, tensor, torch.where(tensor.isnan(), 0, tensor.clamp(max=1)))
     if name in PER_MATCH:
         return tensor[None] if single and tensor.dim() == PER_MATCH[name] else tensor
     shape = tuple(map(int, declared.shape[1:]))

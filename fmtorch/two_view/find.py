@@ -59,10 +59,10 @@ def find_fundamental(
         mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
             the leading B for one pair, and comes as a list where the points do.
         ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
-        score: (B, N), the matcher's confidence in [0, 1], larger is better; used where there is no ratio. Whether it is
-            a probability, as LightGlue's, the matches of each pair tell; otherwise it ranks them alone.
-        prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
-            frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
+        score: (B, N), the matcher's confidence in [0, 1], larger is better, NaN as 0; used where there is no ratio.
+            Whether it is a probability, as LightGlue's, the matches of each pair tell; otherwise it ranks them alone.
+        prior: (B, N), P(inlier) in [0, 1], NaN as 0. Where an estimator uses a prior and none is given, it is derived
+            from the frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames); or (B, N, 2, 2), its covariance in image 1, where points of image 0 are exact.

@@ -30,7 +30,6 @@ EASY = {"estimator": "msac", "hypotheses": 300}
 WRONG = [
     ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
     ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
-    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
     ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
     ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
     ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
@@ -62,10 +61,16 @@ def test_a_list_of_pairs_is_a_padded_batch() -> None:
     assert bool(listed.ok.all())
 
 
-def test_gradients_reach_the_pairs_of_a_list() -> None:
+def test_gradients_reach_the_pairs_of_a_list_and_nan_is_a_prior_of_zero() -> None:
     points = [c.x0[0].double().requires_grad_() for c in PAIRS]
-    fmtorch.find_fundamental(points, [c.x1[0] for c in PAIRS], **FAST).F.sum().backward()
-    assert all(x.grad is not None and bool((x.grad != 0).any()) for x in points)
+    sound = [torch.arange(len(x)) % 3 / 2 for x in points]
+    priors = [torch.where(prior > 0, prior + 5e-7 * (prior == 1), torch.nan).requires_grad_() for prior in sound]
+    expected, F = (
+        fmtorch.find_fundamental(points, [c.x1[0] for c in PAIRS], prior=p, **FAST).F for p in (sound, priors)
+    )
+    F.sum().backward()
+    assert torch.equal(F, expected)
+    assert all(bool(x.grad.isfinite().all() & (x.grad != 0).any()) for x in points + priors)
 
 
 def test_one_size_is_that_of_all_pairs() -> None:
