@@ -152,7 +152,7 @@ class Ransac:
         solver: str | Mapping[str, Any] | Matrices = "seven_point",
         sampler: str | Mapping[str, Any] | sampling.Sampler = "uniform",
         score: str | Mapping[str, Any] | scores.Score = "msac",
-        threshold: float | None = None,
+        threshold: refinement.Pixels | None = None,
         hypotheses: Count = 2000,
         round: Count = 500,
         confidence: Probability | None = 0.9999,
@@ -164,7 +164,7 @@ class Ransac:
         select: refinement.Select | Mapping[str, Any] | None = None,
         focal: Focal | Mapping[str, Any] | None = None,
         inliers: str | Mapping[str, Any] | InlierRule = "threshold",
-        inlier_threshold: float | None = None,
+        inlier_threshold: refinement.Pixels | None = None,
         final: str | Mapping[str, Any] | NoFit = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
