@@ -94,6 +94,12 @@ def test_one_size_is_that_of_all_pairs() -> None:
             ([np.zeros((9, 2))] * 2, [np.zeros((9, 2))] * 2, {name: [np.ones(9), None]}, f"{name} of pair 1 is None;")
             for name in ("score", "prior", "ratio", "noise")
         ),
+        (
+            *SCENE[:2],
+            {**EASY, "score": torch.ones(200, requires_grad=True)},
+            "score requires a gradient, .* passes none",
+        ),
+        (*SCENE[:2], {"estimator": "poselib", "threshold": -1}, "threshold=-1; it must be a number above 0"),
         (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
         (*SCENE[:2], {"size0": (640, 480), "size1": (640, 480)}, r"size1 is \(640, 480\), but .* looks like \(w, h\)"),
         (*SCENE[:2], {"size0": (480, 640), "size1": (48, 64)}, r"size1 is \(48, 64\), but .* of x1 lie outside such"),
