@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
@@ -22,6 +23,7 @@ from fmtorch.two_view.pair_type import with_pair_type
 if TYPE_CHECKING:
     from fmtorch.two_view.lenses import CalibratedLenses
 
+PASSED = ("fmtorch", "contextlib", "torch", "jaxtyping")  # modules on the way from a user's line to a warning
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -150,10 +152,19 @@ def find_fundamental(
         estimate = lenses.completed(estimate, c, seen)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
-        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
+        _warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}")
     if not pair_type:
         return estimate
     return with_pair_type(estimate, seen if lenses is None else lenses.in_view(seen), seed)
+
+
+def _warn(message: str) -> None:
+    """Warn at the line of whoever calls this package, where Python's filter shows each message once."""
+    frame: FrameType | None = sys._getframe()
+    level = 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in PASSED:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level + 1)
 
 
 def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> "CalibratedLenses | None":
