@@ -238,25 +238,11 @@ def find_essential(
 @eager
 @one_thread("cpu")
 def find_homography(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    estimator: str = "homography",
-    mask: Arrays | None = None,
-    ratio: Arrays | None = None,
-    score: Arrays | None = None,
-    prior: Arrays | None = None,
-    lafs0: Arrays | None = None,
-    lafs1: Arrays | None = None,
-    noise: Arrays | None = None,
-    size0: Arrays | None = None,
-    size1: Arrays | None = None,
-    lens: Lens = None,
-    key: Arrays | int | None = None,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
-    **options: Any,
-) -> Estimate:
+    x0: Arrays, x1: Arrays, *, estimator: str = "homography", mask: Arrays | None = None, ratio: Arrays | None = None,
+    score: Arrays | None = None, prior: Arrays | None = None, lafs0: Arrays | None = None, lafs1: Arrays | None = None,
+    noise: Arrays | None = None, size0: Arrays | None = None, size1: Arrays | None = None, lens: Lens = None,
+    key: Arrays | int | None = None, seed: int = 0, config_dir: Path | str | None = None, **options: Any,
+) -> Estimate:  # fmt: skip
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:

@@ -62,12 +62,10 @@ def test_a_list_of_pairs_is_a_padded_batch() -> None:
 
 
 def test_gradients_reach_the_pairs_of_a_list_and_nan_is_a_prior_of_zero() -> None:
-    points = [c.x0[0].double().requires_grad_() for c in PAIRS]
+    points, x1 = [c.x0[0].double().requires_grad_() for c in PAIRS], [c.x1[0] for c in PAIRS]
     sound = [torch.arange(len(x)) % 3 / 2 for x in points]
     priors = [torch.where(prior > 0, prior + 5e-7 * (prior == 1), torch.nan).requires_grad_() for prior in sound]
-    expected, F = (
-        fmtorch.find_fundamental(points, [c.x1[0] for c in PAIRS], prior=p, **FAST).F for p in (sound, priors)
-    )
+    expected, F = (fmtorch.find_fundamental(points, x1, prior=p, **FAST).F for p in (sound, priors))
     F.sum().backward()
     assert torch.equal(F, expected)
     assert all(bool(x.grad.isfinite().all() & (x.grad != 0).any()) for x in points + priors)
@@ -90,22 +88,16 @@ def test_one_size_is_that_of_all_pairs() -> None:
         ([np.zeros((9, 2))], [np.zeros((8, 2))], {}, "pair 0: x0 has shape .9, 2. but x1 .8, 2."),
         ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
         ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),
-        *(
-            ([np.zeros((9, 2))] * 2, [np.zeros((9, 2))] * 2, {name: [np.ones(9), None]}, f"{name} of pair 1 is None;")
-            for name in ("score", "prior", "ratio", "noise")
-        ),
-        (
-            *SCENE[:2],
-            {**EASY, "score": torch.ones(200, requires_grad=True)},
-            "score requires a gradient, .* passes none",
-        ),
+        *(([SCENE.x0] * 2, [SCENE.x1] * 2, {name: [np.ones(200), None]}, f"{name} of pair 1 is None; give it for all")
+          for name in ("score", "prior", "ratio", "noise")),
+        (*SCENE[:2], {**EASY, "score": torch.ones(200, requires_grad=True)}, "score requires a gradient, .* passes"),
         (*SCENE[:2], {"estimator": "poselib", "threshold": -1}, "threshold=-1; it must be a number above 0"),
         (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
         (*SCENE[:2], {"size0": (640, 480), "size1": (640, 480)}, r"size1 is \(640, 480\), but .* looks like \(w, h\)"),
         (*SCENE[:2], {"size0": (480, 640), "size1": (48, 64)}, r"size1 is \(48, 64\), but .* of x1 lie outside such"),
         (*FROM_CENTRE, {"size0": (480, 640), "size1": (480, 640)}, r"size0 is .*640\), but .* of x0 lie outside such"),
     ],
-)
+)  # fmt: skip
 def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]
