@@ -297,7 +297,7 @@ class Estimate(Record):
         if self.sizes is not None and self.sizes_doubtful is not None:
             for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
                 sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
-                said[i].append(f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'")
+                said[i].append(f"image sizes are not given; {sizes} are assumed: give size0 and size1, or 'unknown'")
         for i in [] if lens is None else lens.isfinite().nonzero()[:, 0].tolist():
             said[i].append(BENT.format(float(cast(Tensor, lens)[i])))
         return tuple("; ".join(filter(None, each)) for each in said)
