@@ -16,7 +16,7 @@ from fmtorch.core.checks import MIN_MATCHES, Box, as_tensor, box_of, expect_insi
 from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
 from fmtorch.core.records import Rule
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import MAX_DEVIATION, Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import mean_stretch
 
@@ -300,9 +300,11 @@ def _unknown(name: str, which: str, unknown: tuple[float, float]) -> dict[str, A
 
 def _of_both(value: Any, name: str, unknown: tuple[float, float], forms: str) -> Tensor:
     """What is measured and its deviations, (2, 2) or (B, 2, 2)."""
-    if isinstance(value, list | tuple):
-        value = [unknown if entry is None else entry for entry in value]
-    values = _floating(value, name)
+    try:
+        values = [unknown if entry is None else entry for entry in value] if isinstance(value, list | tuple) else value
+        values = _floating(values, name)
+    except TypeError as error:
+        raise TypeError(f"{name} is {value}; {forms}") from error
     values = values.expand(2, 2) if values.shape == (2,) else values
     if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
         raise ValueError(f"{name} has shape {tuple(values.shape)}; {forms}")
@@ -315,8 +317,9 @@ def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
     values = values.expand(2) if values.shape in ((), (1,)) else values
     if values.dim() > 2 or values.shape[-1] != 2:
         raise ValueError(f"focal has shape {tuple(values.shape)}; with K0 or K1 it must be {FORMS_WITH_K}")
-    if not bool((values >= 0).all()):
-        raise ValueError(f"focal is {values.tolist()}; a relative deviation is not negative")
+    if not bool(((values >= 0) & ((values <= MAX_DEVIATION) | (values == torch.inf))).all()):
+        text = "a relative deviation is not negative, such as 0.05, and unless it is infinite at most 2"
+        raise ValueError(f"focal is {values.tolist()}; with K0 or K1 {text}")
     known = torch.tensor([known0, known1], device=values.device)
     values = torch.where(known, values, torch.inf)
     return torch.stack([torch.ones_like(values), values], -1)
