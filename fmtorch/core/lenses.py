@@ -18,7 +18,8 @@ _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced 
 class Lens:
     """A calibrated lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel.
     model: its name in COLMAP, of `fmtorch.data.MODELS`. coefficients: as `MODELS` names them, without focal lengths and
-    principal point. Raises ValueError for an unknown model and for other coefficients than its own."""
+    principal point. Raises ValueError for an unknown model and for other coefficients than its own, TypeError for what
+    are no numbers."""
 
     fx: float
     fy: float
@@ -31,6 +32,11 @@ class Lens:
         if self.model not in MODELS:
             raise ValueError(f"lens model {self.model!r}; there are: {', '.join(MODELS)}")
         names = MODELS[self.model].coefficients.split()
+        given = getattr(self.coefficients, "tolist", lambda: self.coefficients)()  # of an array, a tensor or a number
+        object.__setattr__(self, "coefficients", tuple(given) if isinstance(given, list | tuple) else (given,))
+        for value in (self.fx, self.fy, self.cx, self.cy, *self.coefficients):
+            if not hasattr(value, "__float__"):
+                raise TypeError(f"a lens has {value!r} among its parameters; they must be numbers")
         if len(self.coefficients) != len(names):
             has = f"has coefficients {', '.join(names)}" if names else "has no coefficients"
             raise ValueError(f"a lens of the model {self.model} {has}; {len(self.coefficients)} are given")

@@ -281,14 +281,10 @@ def lenses(estimate: Estimate) -> list[float]:
 
 @pytest.mark.parametrize(
     ("lens", "fields"),
-    [
-        (-0.1, [[-0.1, 0], [-0.1, 0]]),
-        ((-0.1, 0.02), [[-0.1, 0.02], [-0.1, 0.02]]),
-        (((-0.1, 0), None), [[-0.1, 0], [0, INF]]),
-        ("shared", [[0, INF], [0, INF]]),
-        (np.full((3, 2, 2), 0.1), [[[0.1, 0.1], [0.1, 0.1]]] * 3),
-    ],
-)
+    [(-0.1, [[-0.1, 0], [-0.1, 0]]), ((-0.1, 0.02), [[-0.1, 0.02], [-0.1, 0.02]]),
+     (((-0.1, 0), None), [[-0.1, 0], [0, INF]]), ("shared", [[0, INF], [0, INF]]),
+     (np.full((3, 2, 2), 0.1), [[[0.1, 0.1], [0.1, 0.1]]] * 3)],
+)  # fmt: skip
 def test_forms_of_what_is_known(lens: Any, fields: Any) -> None:
     assert lens_fields(lens)["lens"].tolist() == fields
     assert ("shared_lens" in lens_fields(lens)) == isinstance(lens, str)
