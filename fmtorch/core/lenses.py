@@ -220,6 +220,7 @@ ITERATIONS = 50  # at most; most points take four
 STEP = 1e-6  # of the derivatives, in units of the focal length
 TOLERANCE = 1e-10  # of distorted points, likewise: 1e-7 px at a focal length of 1000 px
 GRAZING = 1e-3  # cotangent of the angle to the axis below which no pinhole's image has the point, in front or behind
+JUDGED, MIN_SPREAD = 500, 0.05  # points that tell of a lens; median distance from its centre without it, to with it
 RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens must lead outwards
 
 
@@ -235,6 +236,17 @@ def undistorted_points(lens: Lens, photographed: NDArray[Any]) -> Matrix:
     fitted, as `undistorted` leaves such pixels black."""
     points, behind = lines_of_sight(lens, photographed)
     return np.where(behind[..., None], np.nan, points)
+
+
+def folded(lens: Lens, pixels: Matrix) -> str:
+    """What is wrong with a lens that leaves most points (n, 2) no place, or one at its centre; else nothing."""
+    pixels, centre = pixels[:: max(1, len(pixels) // JUDGED)], lens.K[:2, 2]
+    there, here = (np.linalg.norm(x - centre, axis=1) for x in (undistorted_points(lens, pixels), pixels))
+    if not len(pixels) or np.median(np.where(np.isnan(there), 0, there) / np.maximum(here, 1)) >= MIN_SPREAD:
+        return ""
+    values = " ".join(f"{value:g}" for value in lens.coefficients)
+    names = MODELS[lens.model].coefficients
+    return f"its lens folds the image or shrinks it to a point ({names} = {values}); calibrate it again"
 
 
 def lines_of_sight(lens: Lens, photographed: NDArray[Any]) -> tuple[Matrix, NDArray[np.bool_]]:

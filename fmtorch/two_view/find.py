@@ -117,7 +117,7 @@ def find_fundamental(
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
             outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
             or option, an estimator of another model, and K0 beside a lens of image 0; for a K that is no calibration
-            matrix of the image and a lens that is not finite, of a single pair (a pair of a batch is ``ok=False``).
+            matrix of the image, and a lens that is not finite or folds it, of a single pair (of a batch: ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:
@@ -291,10 +291,9 @@ def find_homography(
         from fmtorch.two_view.lenses import homographies_with_lenses
 
         return homographies_with_lenses(c, find)
-    c = c.derived(size0=None, size1=None)
+    seen = (c if lenses is None else lenses.undistorted(c)).derived(size0=None, size1=None)
     if lenses is None:
-        return find(c)
-    seen = lenses.undistorted(c)
+        return find(seen)
     return lenses.completed(find(seen), c, seen)
 
 

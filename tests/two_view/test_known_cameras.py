@@ -321,7 +321,7 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
     [
         ({"focal": "same"}, "focal is 'same'; it must be None, 'unknown', 'shared'"),
         ({"focal": "shraed"}, "did you mean 'shared'?"),
-        ({"focal": 800.0}, "focal has shape"),
+        ({"focal": 800.0}, "focal has shape"), ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"focal": (-800.0, 0.1)}, "focal of image 0 of pair 0 is"),
         ({"focal": ((800.0, 0.1), (800.0, -0.1))}, "focal of image 1 of pair 0 is"),
         ({"focal": (800.0, float("nan"))}, "focal of image 0"),
@@ -332,7 +332,6 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"size1": "unknown"}, "size0 is given and the other is 'unknown'"),
         ({"size0": "unknown"}, "size1 is given and the other is 'unknown'"),
         ({"size0": "unknown", "size1": None, "focal": "shared"}, "focal needs the image sizes"),
-        ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
         *(({"K0": K, "K1": K, "focal": focal}, "such as 0.05, and unless it is infinite at most 2")
           for focal in (600, 5, ((600, 0.05), (600, 0.05)))),

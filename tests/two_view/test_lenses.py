@@ -210,6 +210,7 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
         (FUNDAMENTAL, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
         (FUNDAMENTAL, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
         (FUNDAMENTAL, {"lens": (-0.1, -1)} | SIZES, "lens of image 0 of pair 0 is"),
+        *((find, {"lens": (RADIAL, FOLDED)} | SIZES, "image 1: its lens folds") for find in (FUNDAMENTAL, HOMOGRAPHY)),
         (FUNDAMENTAL, {"lens": (-0.1, None)} | SIZES, "lens is (-0.1, None); it must be None, 'unknown', 'shared', la"),
         (FUNDAMENTAL, {"lens": (0.1, 0.1, 0.1)} | SIZES, "lens has shape (3,)"),
         (FUNDAMENTAL, {"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
