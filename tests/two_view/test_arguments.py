@@ -83,7 +83,8 @@ def test_one_size_is_that_of_all_pairs() -> None:
 @pytest.mark.parametrize(
     ("x0", "x1", "options", "message"),
     [
-        ([C.x0[0]], C.x1, {}, "x0 is a list of pairs"), ([C.x0[0]] * 2, [C.x1[0]], {}, "x1 must be a list of 2 arrays"),
+        ([C.x0[0]], C.x1, {}, "x0 is a list of pairs and the other is not"),
+        ([C.x0[0]] * 2, [C.x1[0]], {}, "x1 must be a list of 2 arrays"),
         ([np.zeros((9, 2))], [np.zeros((8, 2))], {}, "pair 0: x0 has shape .9, 2. but x1 .8, 2."),
         ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
         ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),

@@ -296,9 +296,8 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
 @pytest.mark.parametrize(
     ("arguments", "focal"),
     [
-        ({"focal": (800, 0.05)}, [[800, 0.05], [800, 0.05]]),
+        ({"focal": (800, 0.05)}, [[800, 0.05], [800, 0.05]]), ({"focal": ((800, 0), None)}, [[800, 0], [1, INF]]),
         ({"focal": ((800, 0), (900, 0.1))}, [[800, 0], [900, 0.1]]),
-        ({"focal": ((800, 0), None)}, [[800, 0], [1, INF]]),
         ({"focal": np.ones((3, 2, 2))}, np.ones((3, 2, 2)).tolist()), ({"focal": "unknown"}, [[1, INF], [1, INF]]),
         ({"focal": "shared"}, [[1, INF], [1, INF]]), ({"K0": K, "K1": K}, [[1, 0], [1, 0]]),
         ({"K0": K, "K1": K, "focal": 0.05}, [[1, 0.05], [1, 0.05]]),
