@@ -18,7 +18,8 @@ _TINY = 1e-12  # squared radius or parameter below which a quotient is replaced 
 class Lens:
     """A calibrated lens: focal lengths and principal point in pixels, with (0, 0) at the centre of the first pixel.
     model: its name in COLMAP, of `fmtorch.data.MODELS`. coefficients: as `MODELS` names them, without focal lengths and
-    principal point. Raises ValueError for an unknown model and for other coefficients than its own."""
+    principal point. Raises ValueError for an unknown model and for other coefficients than its own, TypeError for what
+    are no numbers."""
 
     fx: float
     fy: float
@@ -31,6 +32,11 @@ class Lens:
         if self.model not in MODELS:
             raise ValueError(f"lens model {self.model!r}; there are: {', '.join(MODELS)}")
         names = MODELS[self.model].coefficients.split()
+        given = getattr(self.coefficients, "tolist", lambda: self.coefficients)()  # of an array, a tensor or a number
+        object.__setattr__(self, "coefficients", tuple(given) if isinstance(given, list | tuple) else (given,))
+        for value in (self.fx, self.fy, self.cx, self.cy, *self.coefficients):
+            if not hasattr(value, "__float__"):
+                raise TypeError(f"a lens has {value!r} among its parameters; they must be numbers")
         if len(self.coefficients) != len(names):
             has = f"has coefficients {', '.join(names)}" if names else "has no coefficients"
             raise ValueError(f"a lens of the model {self.model} {has}; {len(self.coefficients)} are given")
@@ -214,6 +220,7 @@ ITERATIONS = 50  # at most; most points take four
 STEP = 1e-6  # of the derivatives, in units of the focal length
 TOLERANCE = 1e-10  # of distorted points, likewise: 1e-7 px at a focal length of 1000 px
 GRAZING = 1e-3  # cotangent of the angle to the axis below which no pinhole's image has the point, in front or behind
+JUDGED, MIN_SPREAD = 500, 0.05  # points that tell of a lens; median distance from its centre without it, to with it
 RAY = np.linspace(0.0, 1.0, 33)  # where, from the centre to a point, a lens must lead outwards
 
 
@@ -229,6 +236,17 @@ def undistorted_points(lens: Lens, photographed: NDArray[Any]) -> Matrix:
     fitted, as `undistorted` leaves such pixels black."""
     points, behind = lines_of_sight(lens, photographed)
     return np.where(behind[..., None], np.nan, points)
+
+
+def folded(lens: Lens, pixels: Matrix) -> str:
+    """What is wrong with a lens that leaves most points (n, 2) no place, or one at its centre; else nothing."""
+    pixels, centre = pixels[:: max(1, len(pixels) // JUDGED)], lens.K[:2, 2]
+    there, here = (np.linalg.norm(x - centre, axis=1) for x in (undistorted_points(lens, pixels), pixels))
+    if not len(pixels) or np.median(np.where(np.isnan(there), 0, there) / np.maximum(here, 1)) >= MIN_SPREAD:
+        return ""
+    values = " ".join(f"{value:g}" for value in lens.coefficients)
+    names = MODELS[lens.model].coefficients
+    return f"its lens folds the image or shrinks it to a point ({names} = {values}); calibrate it again"
 
 
 def lines_of_sight(lens: Lens, photographed: NDArray[Any]) -> tuple[Matrix, NDArray[np.bool_]]:

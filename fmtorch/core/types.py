@@ -21,11 +21,13 @@ MIN_LENS, MAX_LENS = -0.45, 0.2  # of lenses that leave an image unfolded and it
 PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
 DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive, or a covariance, positive definite")
 SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
+MAX_DEVIATION = 2.0  # relative, of a focal length of which anything is known
 FOCAL = Rule(
     lambda focal: (
-        (focal[..., 1] == torch.inf) | ((focal[..., 1] >= 0) & (focal[..., 0] > 0) & (focal[..., 0] < torch.inf))
+        (focal[..., 1] == torch.inf)
+        | ((focal[..., 1] >= 0) & (focal[..., 1] <= MAX_DEVIATION) & (focal[..., 0] > 0) & (focal[..., 0] < torch.inf))
     ),
-    "it is a positive focal length in pixels and a relative deviation, 0 if exact, infinite if unknown",
+    "it is a positive focal length in px and a relative deviation: such as 0.05, at most 2, 0 if exact, inf if unknown",
 )
 LENS = Rule(
     lambda lens: (
@@ -297,7 +299,7 @@ class Estimate(Record):
         if self.sizes is not None and self.sizes_doubtful is not None:
             for i in self.sizes_doubtful.nonzero()[:, 0].tolist():
                 sizes = " and ".join(f"({h:.0f}, {w:.0f})" for h, w in self.sizes[i].tolist())
-                said[i].append(f"image sizes are not given, and {sizes} is assumed: give size0 and size1, or 'unknown'")
+                said[i].append(f"image sizes are not given; {sizes} are assumed: give size0 and size1, or 'unknown'")
         for i in [] if lens is None else lens.isfinite().nonzero()[:, 0].tolist():
             said[i].append(BENT.format(float(cast(Tensor, lens)[i])))
         return tuple("; ".join(filter(None, each)) for each in said)

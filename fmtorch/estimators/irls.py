@@ -13,7 +13,7 @@ from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
 from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.estimators.refinement import Fit
+from fmtorch.estimators.refinement import Fit, Pixels
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.levenberg_marquardt import Schedule, Weighted, named_loss
@@ -57,7 +57,7 @@ class IterativelyReweighted:
     def __init__(
         self, *, loss: str, threshold: float | Mapping[str, float], starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
         iterations: int = 12, start_scale: float = 0.75, refine_iterations: int = 30,
-        inlier_threshold: float | None = None,
+        inlier_threshold: Pixels | None = None,
     ) -> None:  # fmt: skip
         named_loss(loss)
         if isinstance(threshold, Mapping):

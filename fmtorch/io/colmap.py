@@ -16,7 +16,7 @@ import torch
 
 from fmtorch.core import lazy
 from fmtorch.core.files import replacing
-from fmtorch.core.lenses import MODELS, Lens, undistorted_points, undistortion
+from fmtorch.core.lenses import MODELS, folded, undistortion
 from fmtorch.data.files import Array, Indices, Mask, Matrix, Singles
 from fmtorch.geometry.cameras import MAX_KNOWN_FOCAL, MIN_FOCAL, USUAL_FOCAL, calibration_problems
 from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
@@ -121,7 +121,6 @@ def _one_to_one(pair: StoredPair) -> Mask:
 
 
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
-JUDGED, MIN_SPREAD = 500, 0.05  # keypoints that tell of a lens; median distance from its centre without it, to with it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,24 +166,13 @@ def database_image(name: str, camera: Any, keypoints: Singles) -> DatabaseImage:
         deviation = math.inf
     wrong = calibration_problems(torch.from_numpy(K)[None], torch.tensor([size]), "its calibration")[0]
     pinhole, stretch, pixels = points, None, np.ascontiguousarray(keypoints[:, :2], np.float64)
-    if lens.bends and not (absurd or wrong) and (wrong := _folded(lens, pixels)) == "":
+    if lens.bends and not (absurd or wrong) and (wrong := folded(lens, pixels)) == "":
         rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
         pinhole = (rays @ K[:2, :2].T + K[:2, 2]).astype(np.float32)
         with np.errstate(all="ignore"):
             stretch = undistortion(lens, rays @ lens.K[:2, :2].T + lens.K[:2, 2]).astype(np.float32)
     problem = f"{whose}: {wrong}" if wrong else ""
     return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole, problem, warning, stretch)
-
-
-def _folded(lens: Lens, pixels: Matrix) -> str:
-    """What is wrong with a lens that leaves most keypoints (n, 2) no place, or one at its centre; else nothing."""
-    pixels, centre = pixels[:: max(1, len(pixels) // JUDGED)], lens.K[:2, 2]
-    there, here = (np.linalg.norm(x - centre, axis=1) for x in (undistorted_points(lens, pixels), pixels))
-    if not len(pixels) or np.median(np.where(np.isnan(there), 0, there) / np.maximum(here, 1)) >= MIN_SPREAD:
-        return ""
-    values = " ".join(f"{value:g}" for value in lens.coefficients)
-    names = MODELS[lens.model].coefficients
-    return f"its lens folds the image or shrinks it to a point ({names} = {values}); calibrate it again"
 
 
 MAGIC = b"SQLite format 3\0"

@@ -104,8 +104,8 @@ class HlocMatches(_OpenFiles):
 
     def _image(self, name: str) -> DatabaseImage:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
-        width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
-        return DatabaseImage(name, -1, (int(height), int(width)), np.eye(3), np.inf, points, points)
+        size = predictions.size_under(self._features, f"{name}/image_size")
+        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
 
 
 NPZ = ".npz"
@@ -132,9 +132,8 @@ class MatchFile(_OpenFiles):
         with contextlib.ExitStack() as stack:
             self._file = stack.enter_context(_arrays(path))
             self._keys = set(self._file.keys)
-            ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
-            self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
-            if not self._pairs:
+            self._pairs = sorted({key[:-2] for key in self._keys if key.rpartition("/")[2] in ("x0", "x1")})
+            if not any({f"{pair}x0", f"{pair}x1"} <= self._keys for pair in self._pairs):
                 wanted = "matches x0, x1 (n, 2), alone or of each pair in a group, or hloc's features=F.h5 as well"
                 raise DataError(f"{path} holds no x0 and x1; give {wanted}")
             self._open = stack.pop_all()
@@ -180,6 +179,8 @@ class MatchFile(_OpenFiles):
         return DatabaseImage(image_id, i, known, K, np.inf if K is None else 0.0, points, points)
 
     def _numbers(self, key: str, shape: tuple[int | None, ...]) -> Matrix:
+        if key not in self._keys:
+            raise DataError(f"{key} is missing; a pair has x0 and x1")
         values = self._file.read(key)
         if values.dtype.kind not in "fiu":
             raise DataError(f"{key} is of {values.dtype}; it must hold real numbers")

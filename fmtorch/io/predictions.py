@@ -251,10 +251,19 @@ def _keypoints(file: Any, name: str) -> Matrix:
     return points[:, :2]
 
 
+def size_under(file: Any, key: str) -> Size:
+    """(h, w) of a width and height under a key. Raises DataError where they are those of no image."""
+    width, height = h5.reshaped(file, key, 2)
+    if min(width, height) < 1:
+        raise DataError(
+            f"{h5.where(file, key)} is {width:g} x {height:g}; it must be the width and height of the image"
+        )
+    return int(height), int(width)
+
+
 def _size(file: Any, key: str, image: ImageSource) -> Size:
     if h5.holds(file, key):
-        width, height = h5.reshaped(file, key, 2)
-        return int(height), int(width)
+        return size_under(file, key)
     size = stored_size(image.path)
     if size is None:
         raise DataError(f"{file.file.filename}: {key!r} is missing, and image {image.path} cannot be read either")

@@ -47,32 +47,20 @@ class Comparison(NamedTuple):
 
 @checked
 def sgd(
-    F_gt: Float[Tensor, "*#batch 3 3"],
-    F_est: Float[Tensor, "*#batch 3 3"],
-    size0: Real[Tensor, "*#batch 2"],
-    size1: Real[Tensor, "*#batch 2"],
-    *,
-    samples: int = 1000,
-    seed: int = 0,
-    key: Int[Tensor, "*#batch"] | None = None,
+    F_gt: Float[Tensor, "*#batch 3 3"], F_est: Float[Tensor, "*#batch 3 3"], size0: Real[Tensor, "*#batch 2"],
+    size1: Real[Tensor, "*#batch 2"], *, samples: int = 1000, seed: int = 0, key: Int[Tensor, "*#batch"] | None = None,
     cap: bool = True,
-) -> Float[Tensor, "*#batch"]:
+) -> Float[Tensor, "*#batch"]:  # fmt: skip
     """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`."""
     return _mean_distance(False, (F_gt, F_est), (size0, size1), samples, seed, key, cap)
 
 
 @checked
 def nsgd(
-    F_gt: Float[Tensor, "*#batch 3 3"],
-    F_est: Float[Tensor, "*#batch 3 3"],
-    size0: Real[Tensor, "*#batch 2"],
-    size1: Real[Tensor, "*#batch 2"],
-    *,
-    samples: int = 1000,
-    seed: int = 0,
-    key: Int[Tensor, "*#batch"] | None = None,
+    F_gt: Float[Tensor, "*#batch 3 3"], F_est: Float[Tensor, "*#batch 3 3"], size0: Real[Tensor, "*#batch 2"],
+    size1: Real[Tensor, "*#batch 2"], *, samples: int = 1000, seed: int = 0, key: Int[Tensor, "*#batch"] | None = None,
     cap: bool = True,
-) -> Float[Tensor, "*#batch"]:
+) -> Float[Tensor, "*#batch"]:  # fmt: skip
     """Normalised symmetric geometry distance: each distance divided by the diagonal of the image it is measured in.
 
     The value is at least 0, and 1 where no draw is accepted or a matrix is zero or not finite.
@@ -123,15 +111,9 @@ def _mean_distance(
 @checked
 @torch.no_grad()
 def nsgd_released(
-    F_gt: Float[Tensor, "*#batch 3 3"],
-    F_est: Float[Tensor, "*#batch 3 3"],
-    size0: Real[Tensor, "*#batch 2"],
-    size1: Real[Tensor, "*#batch 2"],
-    *,
-    samples: int = 1000,
-    seed: int = 0,
-    key: Int[Tensor, "*#batch"] | None = None,
-) -> Float[Tensor, "*#batch"]:
+    F_gt: Float[Tensor, "*#batch 3 3"], F_est: Float[Tensor, "*#batch 3 3"], size0: Real[Tensor, "*#batch 2"],
+    size1: Real[Tensor, "*#batch 2"], *, samples: int = 1000, seed: int = 0, key: Int[Tensor, "*#batch"] | None = None,
+) -> Float[Tensor, "*#batch"]:  # fmt: skip
     """NSGD exactly as the released FM-Bench evaluator computes it, faults included; arguments as `nsgd`.
 
     What differs from `nsgd` (github.com/JiawangBian/FM-Bench, ComputeNormlizedSGD.m):

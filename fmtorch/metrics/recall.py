@@ -162,16 +162,10 @@ class InlierRate(NamedTuple):
 
 @checked
 def inlier_rate(
-    F_gt: Float[Tensor, "*#batch 3 3"],
-    x0: Float[Tensor, "*#batch n 2"],
-    x1: Float[Tensor, "*#batch n 2"],
-    inliers: Bool[Tensor, "*#batch n"],
-    size0: Real[Tensor, "*#batch 2"],
-    size1: Real[Tensor, "*#batch 2"],
-    *,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    threshold: float = DIAGONALS,
-) -> InlierRate:
+    F_gt: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"],
+    inliers: Bool[Tensor, "*#batch n"], size0: Real[Tensor, "*#batch 2"], size1: Real[Tensor, "*#batch 2"], *,
+    mask: Bool[Tensor, "*#batch n"] | None = None, threshold: float = DIAGONALS,
+) -> InlierRate:  # fmt: skip
     """Inlier rate before and after estimation, float64: the paper's %Inlier-m and %Inlier as shares.
 
     Args:

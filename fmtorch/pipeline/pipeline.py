@@ -21,7 +21,7 @@ from fmtorch.core.stages import Estimator, FeatureExtractor, GreyPyramid, ImageM
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry.significance import judged
 from fmtorch.jobs.execution import one_thread
-from fmtorch.presets.composition import PIPELINES, build_pruners, compose, open_files, plain
+from fmtorch.presets.composition import PIPELINES, build_pruners, compose, expect_stages, open_files, plain
 from fmtorch.presets.files import available, instantiate, unknown
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.two_view.arguments import expect_possible
@@ -350,6 +350,7 @@ def build_pipeline(
 ) -> Pipeline:
     """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
     model: what the estimator must give, "fundamental" or "homography"; None: either."""
+    expect_stages(config)
     extractor = cached(instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair

@@ -248,18 +248,11 @@ NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_foc
 
 
 def match(
-    image0: GivenImage,
-    image1: GivenImage,
-    *,
-    pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
-    device: torch.device | str | None = None,
-    longest_side: int = 1600,
-    seed: int = 0,
-    K0: arguments.Arrays | None = None,
-    K1: arguments.Arrays | None = None,
-    focal: arguments.Focal = None,
+    image0: GivenImage, image1: GivenImage, *, pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
+    device: torch.device | str | None = None, longest_side: int = 1600, seed: int = 0,
+    K0: arguments.Arrays | None = None, K1: arguments.Arrays | None = None, focal: arguments.Focal = None,
     lens: arguments.Lens = None,
-) -> MatchResult:
+) -> MatchResult:  # fmt: skip
     """Match two photographs and estimate their fundamental matrix; with K0, K1 or focal also their relative pose.
 
     Photographs that cannot be related are no error: `related` is False, and mostly `ok` is True, since some F is found.

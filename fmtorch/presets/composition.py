@@ -25,6 +25,7 @@ from fmtorch.core.stages import Pruner
 from fmtorch.jobs.execution import Execution
 from fmtorch.presets import files
 
+LIGHTGLUE = "fmtorch.matching.lightglue.LightGlue"
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
 
@@ -176,7 +177,13 @@ def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def expect_stages(config: DictConfig) -> None:
-    """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options."""
+    """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options, and
+    where the features are others than this project's LightGlue is for."""
+    room, _, kind = str(plain(config.get("features")).get("_target_")).rpartition(".")
+    matcher, names = plain(config.get("matcher")), kind.lower() if room.endswith(".kornia_features") else "none"
+    if matcher.get("_target_") == LIGHTGLUE and room.startswith("fmtorch.") and matcher.get("features") != names:
+        hint = f"there is no LightGlue for {kind}" if names == "none" else f"give matcher.features={names}"
+        raise ValueError(f"matcher.features={matcher.get('features')} is for other features than are computed: {hint}")
     for group in STAGES:
         if group != "pruner" and group in config:  # a training has no estimator
             files.expect_buildable(plain(config[group]), group)

@@ -51,6 +51,14 @@ class Evaluation:
     label: Tensor
 
 
+def expect_figure(name: str, uses: Iterable[str]) -> None:
+    """Raises ValueError where validation with these uses has no figure of this name."""
+    recalls = [f"{use}/{figure}" for use in uses for figure in ("recall@0.05", "recall@0.01", "AUC@0.05")]
+    known = ["log_loss", "match_precision", "match_recall", "calibration_error", *recalls]
+    if name not in known and not name.startswith(tuple(f"{each}/" for each in recalls[2::3])):  # of a family
+        raise ValueError(f"validation.monitor={name}; it must be one of: {', '.join(known)}, or USE/AUC@0.05/FAMILY")
+
+
 class Validation:
     """Evaluates a network on labelled matches of single pairs.
 

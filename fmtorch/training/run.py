@@ -45,7 +45,7 @@ from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
-from fmtorch.training.export import Evaluation, Use, Validation, quiet, write_result
+from fmtorch.training.export import Evaluation, Use, Validation, expect_figure, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
 from fmtorch.training.matched_pairs import MatchedPairs, NamedPairs, OANetPairs, front
 from fmtorch.training.objective import Objective
@@ -298,6 +298,7 @@ def run(config: DictConfig, name: str) -> Path:
     network_config = network_of(config, name)
     objective = Objective(**dataclasses.asdict(options.objective))
     uses = {key: use_of(key, value) for key, value in options.validation.uses.items()}
+    expect_figure(options.validation.monitor, uses)
     with terminal.progress_bars() as progress:
         matches = labelled_matches(config, options, progress)
     identity = {

@@ -16,7 +16,7 @@ from fmtorch.core.checks import MIN_MATCHES, Box, as_tensor, box_of, expect_insi
 from fmtorch.core.lenses import Lens as CalibratedLens
 from fmtorch.core.options import nearest
 from fmtorch.core.records import Rule
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import MAX_DEVIATION, Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import mean_stretch
 
@@ -37,8 +37,9 @@ PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Cor
 """The dimensions of what has an entry for each match, of one pair."""
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
+ROUNDING = 1e-6  # by which what is within [0, 1] may exceed 1
 RATIO = Rule(
-    lambda ratio: ~((ratio < 0) | (ratio > 1 + 1e-6)),
+    lambda ratio: ~((ratio < 0) | (ratio > 1 + ROUNDING)),
     "it is the distance of the nearest descriptor over that of the second nearest, within [0, 1]. Of raw distances, "
     "such as DMatch.distance, give none, or as `ratio` quotients; `score` is a confidence in [0, 1], larger is better",
 )
@@ -173,6 +174,8 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
         tensor = tensor.to(torch.int64)
     elif not declared.holds(tensor.dtype) or tensor.is_floating_point():
         tensor = tensor.to(torch.bool) if name in ("mask", "mutual") else widened(tensor)
+    if name in ("score", "prior"):  # where nothing is known nothing speaks for the match
+        tensor = torch.where(tensor > 1 + ROUNDING, tensor, torch.where(tensor.isnan(), 0, tensor.clamp(max=1)))
     if name in PER_MATCH:
         return tensor[None] if single and tensor.dim() == PER_MATCH[name] else tensor
     shape = tuple(map(int, declared.shape[1:]))
@@ -191,6 +194,8 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
         listed = isinstance(value, list | tuple | Tensor | np.ndarray) and getattr(value, "ndim", 1) > 0
         if not listed or len(cast(Any, value)) != count:
             raise ValueError(f"{name} must be a list of {count} arrays, one for each pair of x0")
+        if name != "mask" and any(missing := [entry is None for entry in cast(Any, value)]):
+            raise ValueError(f"{name} of pair {missing.index(True)} is None; give it for all pairs, or for none")
     if not count:
         return _batch(torch.zeros(0, 0, 2), torch.zeros(0, 0, 2), {})
     batch_fields = {
@@ -295,9 +300,11 @@ def _unknown(name: str, which: str, unknown: tuple[float, float]) -> dict[str, A
 
 def _of_both(value: Any, name: str, unknown: tuple[float, float], forms: str) -> Tensor:
     """What is measured and its deviations, (2, 2) or (B, 2, 2)."""
-    if isinstance(value, list | tuple):
-        value = [unknown if entry is None else entry for entry in value]
-    values = _floating(value, name)
+    try:
+        values = [unknown if entry is None else entry for entry in value] if isinstance(value, list | tuple) else value
+        values = _floating(values, name)
+    except TypeError as error:
+        raise TypeError(f"{name} is {value}; {forms}") from error
     values = values.expand(2, 2) if values.shape == (2,) else values
     if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
         raise ValueError(f"{name} has shape {tuple(values.shape)}; {forms}")
@@ -310,8 +317,9 @@ def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
     values = values.expand(2) if values.shape in ((), (1,)) else values
     if values.dim() > 2 or values.shape[-1] != 2:
         raise ValueError(f"focal has shape {tuple(values.shape)}; with K0 or K1 it must be {FORMS_WITH_K}")
-    if not bool((values >= 0).all()):
-        raise ValueError(f"focal is {values.tolist()}; a relative deviation is not negative")
+    if not bool(((values >= 0) & ((values <= MAX_DEVIATION) | (values == torch.inf))).all()):
+        text = "a relative deviation is not negative, such as 0.05, and unless it is infinite at most 2"
+        raise ValueError(f"focal is {values.tolist()}; with K0 or K1 {text}")
     known = torch.tensor([known0, known1], device=values.device)
     values = torch.where(known, values, torch.inf)
     return torch.stack([torch.ones_like(values), values], -1)

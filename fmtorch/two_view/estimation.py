@@ -68,7 +68,8 @@ def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> No
     reached = getattr(estimator, "gradients_reach", None)
     if reached is None or not (torch.is_grad_enabled() and c.requires_grad):
         return
-    for field in ("x0", "x1", "prior", "noise"):
+    derived = "prior" in reached and getattr(estimator, "uses_prior", False)  # a prior, of ratio or score
+    for field in ("x0", "x1", "noise", *(("prior",) if c.prior is not None or derived else ("ratio", "score"))):
         value = getattr(c, field)
         if value is not None and value.requires_grad and field not in reached:
             raise ValueError(

@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import torch
@@ -22,6 +23,7 @@ from fmtorch.two_view.pair_type import with_pair_type
 if TYPE_CHECKING:
     from fmtorch.two_view.lenses import CalibratedLenses
 
+PASSED = ("fmtorch", "contextlib", "torch", "jaxtyping")  # modules on the way from a user's line to a warning
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -59,10 +61,10 @@ def find_fundamental(
         mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
             the leading B for one pair, and comes as a list where the points do.
         ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
-        score: (B, N), the matcher's confidence in [0, 1], larger is better; used where there is no ratio. Whether it is
-            a probability, as LightGlue's, the matches of each pair tell; otherwise it ranks them alone.
-        prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
-            frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
+        score: (B, N), the matcher's confidence in [0, 1], larger is better, NaN as 0; used where there is no ratio.
+            Whether it is a probability, as LightGlue's, the matches of each pair tell; otherwise it ranks them alone.
+        prior: (B, N), P(inlier) in [0, 1], NaN as 0. Where an estimator uses a prior and none is given, it is derived
+            from the frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames); or (B, N, 2, 2), its covariance in image 1, where points of image 0 are exact.
@@ -115,7 +117,7 @@ def find_fundamental(
         ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
             outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
             or option, an estimator of another model, and K0 beside a lens of image 0; for a K that is no calibration
-            matrix of the image and a lens that is not finite, of a single pair (a pair of a batch is ``ok=False``).
+            matrix of the image, and a lens that is not finite or folds it, of a single pair (of a batch: ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:
@@ -150,10 +152,19 @@ def find_fundamental(
         estimate = lenses.completed(estimate, c, seen)
     if estimate.contradicted is not None and bool(estimate.contradicted.any()):
         pairs = estimate.contradicted.nonzero()[:, 0].tolist()
-        warnings.warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}", stacklevel=2)
+        _warn(f"pair {', '.join(map(str, pairs))}: {CONTRADICTED}")
     if not pair_type:
         return estimate
     return with_pair_type(estimate, seen if lenses is None else lenses.in_view(seen), seed)
+
+
+def _warn(message: str) -> None:
+    """Warn at the line of whoever calls this package, where Python's filter shows each message once."""
+    frame: FrameType | None = sys._getframe()
+    level = 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in PASSED:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level + 1)
 
 
 def _lenses(lens: Lens, x0: Arrays, K0: Arrays | None = None, K1: Arrays | None = None) -> "CalibratedLenses | None":
@@ -227,25 +238,11 @@ def find_essential(
 @eager
 @one_thread("cpu")
 def find_homography(
-    x0: Arrays,
-    x1: Arrays,
-    *,
-    estimator: str = "homography",
-    mask: Arrays | None = None,
-    ratio: Arrays | None = None,
-    score: Arrays | None = None,
-    prior: Arrays | None = None,
-    lafs0: Arrays | None = None,
-    lafs1: Arrays | None = None,
-    noise: Arrays | None = None,
-    size0: Arrays | None = None,
-    size1: Arrays | None = None,
-    lens: Lens = None,
-    key: Arrays | int | None = None,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
-    **options: Any,
-) -> Estimate:
+    x0: Arrays, x1: Arrays, *, estimator: str = "homography", mask: Arrays | None = None, ratio: Arrays | None = None,
+    score: Arrays | None = None, prior: Arrays | None = None, lafs0: Arrays | None = None, lafs1: Arrays | None = None,
+    noise: Arrays | None = None, size0: Arrays | None = None, size1: Arrays | None = None, lens: Lens = None,
+    key: Arrays | int | None = None, seed: int = 0, config_dir: Path | str | None = None, **options: Any,
+) -> Estimate:  # fmt: skip
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:
@@ -294,10 +291,9 @@ def find_homography(
         from fmtorch.two_view.lenses import homographies_with_lenses
 
         return homographies_with_lenses(c, find)
-    c = c.derived(size0=None, size1=None)
+    seen = (c if lenses is None else lenses.undistorted(c)).derived(size0=None, size1=None)
     if lenses is None:
-        return find(c)
-    seen = lenses.undistorted(c)
+        return find(seen)
     return lenses.completed(find(seen), c, seen)
 
 

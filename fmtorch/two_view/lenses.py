@@ -1,5 +1,6 @@
 """Matches of photographs whose lenses are calibrated, as pinholes would have them."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -9,7 +10,7 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.lenses import Lens, Matrix, division, division_lens, lines_of_sight, undistortion
+from fmtorch.core.lenses import MODELS, Lens, Matrix, division, division_lens, folded, lines_of_sight, undistortion
 from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate
 from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
@@ -21,6 +22,7 @@ Lenses = tuple[Lens | None, Lens | None]  # of both images of a pair; None of a 
 FORMS = "a lens for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one for each pair"
 
 
+GRID = 9  # points along each side of an image that tell whether a lens folds it
 MAX_STRETCH = 100.0  # of a match in both images: 3 degrees from across the axes of fish-eyes
 
 
@@ -40,6 +42,9 @@ class CalibratedLenses:
             raise ValueError(f"lens has lenses for {len(self.pairs)} pairs of {count}; it must be {FORMS}")
         self.K = self._calibration(0, K0), self._calibration(1, K1)
         self.problems = [self._problem(pair) for pair in self.pairs]
+        self._expect_valid()
+
+    def _expect_valid(self) -> None:
         if len(self.pairs) == 1 and self.problems[0]:
             raise ValueError(self.problems[0])
 
@@ -68,6 +73,10 @@ class CalibratedLenses:
     def undistorted(self, c: Correspondences) -> Correspondences:
         """The matches as pinholes would have them; none of a pair whose lens is none."""
         of = range(len(self.pairs)) if len(self.pairs) == len(c) else [0] * len(c)
+        for k, sizes in enumerate((c.size0, c.size1)):
+            for i, (h, w) in zip(of, [] if sizes is None else sizes.tolist(), strict=False):
+                self.problems[i] = self.problems[i] or _folded(self.pairs[i][k], k, h, w)
+        self._expect_valid()
         valid = torch.tensor([not self.problems[i] for i in of], dtype=torch.bool, device=c.mask.device)
         seen, self.behind = matches_in_sight(c.keep(valid[:, None] & c.mask), [self.pairs[i] for i in of])
         return seen
@@ -102,6 +111,17 @@ class CalibratedLenses:
             fields["covariance"] = torch.where(other[:, None, None], torch.nan, estimate.covariance)
             fields["tangents"] = torch.where(opposite[:, None, None], -1, 1) * estimate.tangents
         return estimate.derived(R=R, t=t, E=matmul3(cross_matrix(t), R), **fields)
+
+
+@functools.lru_cache(maxsize=256)
+def _folded(lens: Lens | None, k: int, h: float, w: float) -> str:
+    """What is wrong with a lens of image k, of size (h, w), other than a fish-eye, which may see less than it."""
+    if lens is None or not lens.bends or MODELS[lens.model].fisheye or MODELS[lens.model].rays is not None:
+        return ""
+    cells = (np.arange(GRID) + 0.5) / GRID
+    pixels = np.stack(np.meshgrid(cells * w - 0.5, cells * h - 0.5), -1)
+    said = folded(lens, pixels.reshape(-1, 2))
+    return said and f"image {k}: {said}"
 
 
 def undistorted_matches(c: Correspondences, lenses: Sequence[Lenses]) -> Correspondences:

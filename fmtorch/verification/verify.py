@@ -310,22 +310,12 @@ MATCHES_NEED = "matches alone need an output: matches=FILE.npz output=VERIFIED.n
 
 
 def verify(
-    path: Path | str | None = None,
-    *,
-    features: Path | str | None = None,
-    matches: Path | str | None = None,
-    output: Path | str | None = None,
-    cameras: str = "stored",
-    lens: arguments.Lens = None,
-    estimator: str = "fmtorch",
-    force: bool = False,
-    seed: int = 0,
-    config_dir: Path | str | None = None,
-    report: Callable[[int, int], None] | None = None,
-    execution: Execution | None = None,
-    shard: str | None = None,
+    path: Path | str | None = None, *, features: Path | str | None = None, matches: Path | str | None = None,
+    output: Path | str | None = None, cameras: str = "stored", lens: arguments.Lens = None, estimator: str = "fmtorch",
+    force: bool = False, seed: int = 0, config_dir: Path | str | None = None,
+    report: Callable[[int, int], None] | None = None, execution: Execution | None = None, shard: str | None = None,
     **options: Any,
-) -> Verification:
+) -> Verification:  # fmt: skip
     """Estimate the two-view geometry of every pair with matches in a COLMAP database, as its mappers read it.
 
     Configuration, inlier matches, F, E, H and relative pose are written, in one transaction. Until all pairs are done a

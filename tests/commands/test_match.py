@@ -184,8 +184,10 @@ def test_overrides_and_a_callers_own_hydra() -> None:
     assert built.pruners["gms"]._options["with_scale"]  # type: ignore[attr-defined]
     assert built.pruners["gms"]._options["threshold_factor"] == 4  # type: ignore[attr-defined]
     assert not GlobalHydra.instance().is_initialized()
-    with pytest.raises(ValueError, match=r"pruner\.gms\.angle"):
-        load_pipeline("sift_gms", overrides=["pruner.gms.angle=1"])
+    for words, said in ((["pruner.gms.angle=1"], r"pruner\.gms\.angle"), (["matcher=lightglue"], "Glue for SIFT"),
+                        (["matcher=lightglue", "features=disk"], r"give matcher\.features=disk")):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            load_pipeline("sift_gms", overrides=words)
 
 
 def test_the_command(command: Callable[..., str], tmp_path: Path) -> None:

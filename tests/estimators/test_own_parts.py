@@ -184,6 +184,7 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
         ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: prior_weighted"),
         ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
         ({"pool": 0}, "pool=0; it must be a whole number of at least 1"),
+        ({"inlier_threshold": 0}, "inlier_threshold=0; it must be a number above 0 or null"),
         ({"confidence": 1.0}, "confidence=1.0; it must be a number between 0 and 1 or null"),
         (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
         (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),

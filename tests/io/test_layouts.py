@@ -121,6 +121,7 @@ DAMAGE: list[tuple[str, str, str, Callable[[np.ndarray], Any] | None, str]] = [
     ("hloc", "feats-sift.h5", "s1/Images/00000001.png/keypoints", lambda v: v[:, 0], r"keypoints' has shape \(65,\)"),
     ("hloc", "feats-sift.h5", FIRST, lambda v: v[:, :1], r"keypoints' has shape \(67, 1\); it must be"),
     ("ransac_tutorial", "church/K1_K2.h5", TUTORIAL, lambda v: 0 * v, "K1_K2.h5: .*: a calibration matrix is singular"),
+    ("hloc", "feats-sift.h5", f"{FIRST[:-9]}image_size", lambda v: 0 * v, "image_size' is 0 x 0; it must be the width"),
     ("hloc", HLOC, f"{PAIR}/matches0", None, "no matches0 of the pair s1/Images"),
     ("hloc", HLOC, f"{PAIR}/matches0", lambda v: v[:-3], r"matching_scores0' has shape \(67,\); it must be \(64\)"),
     ("hloc", "feats-sift.h5", FIRST, lambda v: v[:9], "67 entries, but the first image has 9"),

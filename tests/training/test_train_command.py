@@ -143,14 +143,14 @@ def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ("planes.views=1", "planes.views=1; a pair needs 2"),
         ("planes.views=many", "planes.views=many; it must be a whole number"),
         ("planes.photographs=nothing", "nothing is no folder of photographs"),
-        ("pruner=ratio", "pruner=lc has nothing to train"),
+        ("pruner=ratio", "pruner=lc has nothing to train"), ("seed=0", "nowhere: no such folder"),
         ("batch=0", "batch=0; it must be a whole number of at least 1"),
         ("limit=-3", "limit=-3; it must be a whole number of at least 1"),
         ("optimisation.steps=0", "learning_rate and steps must be positive"),
         ("objective.coordinates=pixels", "it must be one of: size, K"),
-        ("seed=0", "nowhere: no such folder"),
+        ("validation.monitor=foo", "validation.monitor=foo; it must be one of: log_loss, match_precision"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_told_before_anything_is_written(option, message, tmp_path, monkeypatch):
     with pytest.raises((ValueError, FileNotFoundError), match=re.escape(message)):
         trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")

@@ -30,7 +30,6 @@ EASY = {"estimator": "msac", "hypotheses": 300}
 WRONG = [
     ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
     ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
-    ("prior", float("nan"), "prior of match 3 of pair 1 is nan"),
     ("noise", 0.0, r"noise of match 3 of pair 1 is 0\.0; it is a standard deviation, positive"),
     ("noise", -1.0, "noise of match 3 of pair 1 is -1"),
     ("noise", float("nan"), "noise of match 3 of pair 1 is nan"),
@@ -62,10 +61,14 @@ def test_a_list_of_pairs_is_a_padded_batch() -> None:
     assert bool(listed.ok.all())
 
 
-def test_gradients_reach_the_pairs_of_a_list() -> None:
-    points = [c.x0[0].double().requires_grad_() for c in PAIRS]
-    fmtorch.find_fundamental(points, [c.x1[0] for c in PAIRS], **FAST).F.sum().backward()
-    assert all(x.grad is not None and bool((x.grad != 0).any()) for x in points)
+def test_gradients_reach_the_pairs_of_a_list_and_nan_is_a_prior_of_zero() -> None:
+    points, x1 = [c.x0[0].double().requires_grad_() for c in PAIRS], [c.x1[0] for c in PAIRS]
+    sound = [torch.arange(len(x)) % 3 / 2 for x in points]
+    priors = [torch.where(prior > 0, prior + 5e-7 * (prior == 1), torch.nan).requires_grad_() for prior in sound]
+    expected, F = (fmtorch.find_fundamental(points, x1, prior=p, **FAST).F for p in (sound, priors))
+    F.sum().backward()
+    assert torch.equal(F, expected)
+    assert all(bool(x.grad.isfinite().all() & (x.grad != 0).any()) for x in points + priors)
 
 
 def test_one_size_is_that_of_all_pairs() -> None:
@@ -80,17 +83,21 @@ def test_one_size_is_that_of_all_pairs() -> None:
 @pytest.mark.parametrize(
     ("x0", "x1", "options", "message"),
     [
-        ([np.zeros((9, 2))], np.zeros((9, 2)), {}, "x0 is a list of pairs and the other is not"),
-        ([np.zeros((9, 2))] * 2, [np.zeros((9, 2))], {}, "x1 must be a list of 2 arrays"),
+        ([C.x0[0]], C.x1, {}, "x0 is a list of pairs and the other is not"),
+        ([C.x0[0]] * 2, [C.x1[0]], {}, "x1 must be a list of 2 arrays"),
         ([np.zeros((9, 2))], [np.zeros((8, 2))], {}, "pair 0: x0 has shape .9, 2. but x1 .8, 2."),
         ([np.zeros((9, 3))], [np.zeros((9, 3))], {}, "pair 0: x0 has shape .9, 3.; it must be"),
         ([np.zeros((9, 2))], [np.zeros((9, 2))], {"prior": np.zeros((2, 9))}, "prior must be a list of 1 arrays"),
+        *(([SCENE.x0] * 2, [SCENE.x1] * 2, {name: [np.ones(200), None]}, f"{name} of pair 1 is None; give it for all")
+          for name in ("score", "prior", "ratio", "noise")),
+        (*SCENE[:2], {**EASY, "score": torch.ones(200, requires_grad=True)}, "score requires a gradient, .* passes"),
+        (*SCENE[:2], {"estimator": "poselib", "threshold": -1}, "threshold=-1; it must be a number above 0"),
         (np.zeros((9, 2)), np.zeros((9, 2)), {"key": np.array(0.5)}, "key is of torch.float64; it must be whole"),
         (*SCENE[:2], {"size0": (640, 480), "size1": (640, 480)}, r"size1 is \(640, 480\), but .* looks like \(w, h\)"),
         (*SCENE[:2], {"size0": (480, 640), "size1": (48, 64)}, r"size1 is \(48, 64\), but .* of x1 lie outside such"),
         (*FROM_CENTRE, {"size0": (480, 640), "size1": (480, 640)}, r"size0 is .*640\), but .* of x0 lie outside such"),
     ],
-)
+)  # fmt: skip
 def test_what_does_not_fit_is_named(x0: object, x1: object, options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fmtorch.find_fundamental(x0, x1, **options)  # type: ignore[arg-type]

@@ -76,14 +76,12 @@ def test_calibrated_cameras_need_six_matches() -> None:
     ("cameras", "known", "tolerance"),
     [
         (ZOOMED, {"focal": ((650.0, 0.0), None)}, 0.02),
-        (ZOOMED, {"focal": ((640.0, 0.05), (840.0, 0.05))}, 0.02),
-        (CENTRAL, {"focal": "shared"}, 0.01),
-        (CENTRAL, {"focal": (650.0, 0.0)}, 1e-6),
-        (ZOOMED, {"K0": ZOOMED[0]}, 0.02),
+        (ZOOMED, {"focal": ((640.0, 0.05), (840.0, 0.05))}, 0.02), (CENTRAL, {"focal": "shared"}, 0.01),
+        (CENTRAL, {"focal": (650.0, 0.0)}, 1e-6), (ZOOMED, {"K0": ZOOMED[0]}, 0.02),
         (ZOOMED, {"K0": ZOOMED[0], "K1": 0.95 * (ZOOMED[1] - np.eye(3)) + np.eye(3), "focal": (0.0, 0.05)}, 0.02),
     ],
     ids=["one", "both roughly", "shared", "both", "one K", "one K exact, the other rough"],
-)
+)  # fmt: skip
 def test_focal_lengths_are_recovered(cameras: tuple, known: dict[str, Any], tolerance: float) -> None:
     """From exact matches of pairs that determine them; the prior pulls a little."""
     if "K1" in known:
@@ -298,21 +296,17 @@ def test_real_pairs_keep_the_order_of_knowledge() -> None:
 @pytest.mark.parametrize(
     ("arguments", "focal"),
     [
-        ({"focal": (800, 0.05)}, [[800, 0.05], [800, 0.05]]),
+        ({"focal": (800, 0.05)}, [[800, 0.05], [800, 0.05]]), ({"focal": ((800, 0), None)}, [[800, 0], [1, INF]]),
         ({"focal": ((800, 0), (900, 0.1))}, [[800, 0], [900, 0.1]]),
-        ({"focal": ((800, 0), None)}, [[800, 0], [1, INF]]),
-        ({"focal": np.ones((3, 2, 2))}, np.ones((3, 2, 2)).tolist()),
-        ({"focal": "unknown"}, [[1, INF], [1, INF]]),
-        ({"focal": "shared"}, [[1, INF], [1, INF]]),
-        ({"K0": K, "K1": K}, [[1, 0], [1, 0]]),
+        ({"focal": np.ones((3, 2, 2))}, np.ones((3, 2, 2)).tolist()), ({"focal": "unknown"}, [[1, INF], [1, INF]]),
+        ({"focal": "shared"}, [[1, INF], [1, INF]]), ({"K0": K, "K1": K}, [[1, 0], [1, 0]]),
         ({"K0": K, "K1": K, "focal": 0.05}, [[1, 0.05], [1, 0.05]]),
         ({"K0": K, "K1": K, "focal": (0, 0.1)}, [[1, 0], [1, 0.1]]),
         ({"K0": K, "K1": K, "focal": np.full((3, 2), 0.1)}, [[[1, 0.1], [1, 0.1]]] * 3),
-        ({"K0": K}, [[1, 0], [1, INF]]),
-        ({"K1": K, "focal": 0.1}, [[1, INF], [1, 0.1]]),
+        ({"K0": K}, [[1, 0], [1, INF]]), ({"K1": K, "focal": 0.1}, [[1, INF], [1, 0.1]]),
         ({"K0": K, "K1": K, "focal": "shared"}, [[1, INF], [1, INF]]),
     ],
-)
+)  # fmt: skip
 def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> None:
     fields = camera_fields(arguments.get("K0"), arguments.get("K1"), arguments.get("focal"), True)
     assert fields["focal"].tolist() == focal
@@ -326,7 +320,7 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
     [
         ({"focal": "same"}, "focal is 'same'; it must be None, 'unknown', 'shared'"),
         ({"focal": "shraed"}, "did you mean 'shared'?"),
-        ({"focal": 800.0}, "focal has shape"),
+        ({"focal": 800.0}, "focal has shape"), ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"focal": (-800.0, 0.1)}, "focal of image 0 of pair 0 is"),
         ({"focal": ((800.0, 0.1), (800.0, -0.1))}, "focal of image 1 of pair 0 is"),
         ({"focal": (800.0, float("nan"))}, "focal of image 0"),
@@ -337,15 +331,16 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"size1": "unknown"}, "size0 is given and the other is 'unknown'"),
         ({"size0": "unknown"}, "size1 is given and the other is 'unknown'"),
         ({"size0": "unknown", "size1": None, "focal": "shared"}, "focal needs the image sizes"),
-        ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
-        ({"K0": torch.eye(2), "K1": K}, "K0 has shape"),
-        ({"K0": K, "K1": 0 * K}, "K1 is singular"),
+        *(({"K0": K, "K1": K, "focal": focal}, "such as 0.05, and unless it is infinite at most 2")
+          for focal in (600, 5, ((600, 0.05), (600, 0.05)))),
+        ({"focal": (600, 600)}, "focal of image 0 of pair 0 is [600.0, 600.0]; it is a positive focal length in px"),
+        ({"K0": torch.eye(2), "K1": K}, "K0 has shape"), ({"K0": K, "K1": 0 * K}, "K1 is singular"),
         ({"K0": K / torch.tensor([[100.0], [100], [1]]), "K1": K}, "K0 has a focal length of 5 for an"),
         ({"K0": K, "K1": K * torch.tensor([[1e5], [1e5], [1]])}, "K1 has a focal length of 5e+07 for"),
         ({"K0": K, "K1": K / torch.tensor([[51], [51], [1]]), "size0": None, "size1": None}, "K1 has points"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_are_named(arguments: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=r"^") as error:
         fmtorch.find_fundamental(SCENE.x0, SCENE.x1, **(SIZES | arguments))

@@ -210,6 +210,8 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
         (FUNDAMENTAL, {"lens": "fisheye"} | SIZES, "lens is 'fisheye'; it must be None, 'unknown', 'shared', lambda"),
         (FUNDAMENTAL, {"lens": -0.6} | SIZES, "lens of image 0 of pair 0 is [-0.6, 0.0]; it is lambda in half diag"),
         (FUNDAMENTAL, {"lens": (-0.1, -1)} | SIZES, "lens of image 0 of pair 0 is"),
+        *((find, {"lens": (RADIAL, FOLDED)} | SIZES, "image 1: its lens folds") for find in (FUNDAMENTAL, HOMOGRAPHY)),
+        (FUNDAMENTAL, {"lens": (-0.1, None)} | SIZES, "lens is (-0.1, None); it must be None, 'unknown', 'shared', la"),
         (FUNDAMENTAL, {"lens": (0.1, 0.1, 0.1)} | SIZES, "lens has shape (3,)"),
         (FUNDAMENTAL, {"lens": "shared", "size0": "unknown", "size1": "unknown"}, "lens needs the image sizes"),
         (FUNDAMENTAL, {"lens": "shared"} | KNOWN, "lens needs the image"),
@@ -223,7 +225,7 @@ def test_gradients_reach_the_photographs_points(find: Any) -> None:
 )
 def test_what_makes_no_sense_is_refused_by_name(find: Any, said: dict[str, Any], message: str) -> None:
     x0, x1 = photographs(RADIAL, RADIAL)
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises((TypeError, ValueError), match=re.escape(message)):
         find(x0, x1, **said)
     with pytest.raises(ValueError, match="lens is given, and its estimates have no gradients"):
         fmtorch.find_homography(torch.from_numpy(x0).requires_grad_(), x1, **UNKNOWN)
@@ -233,10 +235,12 @@ def test_lenses_are_of_known_models_with_all_coefficients() -> None:
     for model, coefficients, said in (
         ("MAGIC", (), "lens model 'MAGIC'; there are: SIMPLE_PINHOLE, "),
         ("OPENCV", (0.1,), "a lens of the model OPENCV has coefficients k1, k2, p1, p2; 1 are given"),
-        ("PINHOLE", (0.1,), "of the model PINHOLE has no coefficients; 1 are given"),
+        ("PINHOLE", 0.1, "of the model PINHOLE has no coefficients; 1 are given"),
+        ("SIMPLE_RADIAL", "a", "a lens has 'a' among its parameters; they must be numbers"),
     ):
-        with pytest.raises(ValueError, match=said):
-            Lens(500.0, 500.0, 320.0, 240.0, model, coefficients)
+        with pytest.raises((TypeError, ValueError), match=said):
+            Lens(500.0, 500.0, 320.0, 240.0, model, coefficients)  # type: ignore[arg-type]
+    assert Lens(1, 1, 0, 0, "RADIAL", torch.ones(2)) == Lens(1, 1, 0, 0, "RADIAL", (1.0, 1.0))  # type: ignore[arg-type]
     x0, x1 = photographs(RADIAL, RADIAL)
     with pytest.raises(ValueError, match="lens has None for image 0 of some pairs"):
         fmtorch.find_fundamental(x0[None].repeat(2, 0), x1[None].repeat(2, 0), lens=[(RADIAL, None), (None, RADIAL)])

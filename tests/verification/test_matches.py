@@ -124,20 +124,20 @@ def test_broken_pairs_are_lines_and_stay_out(tmp_path: Path) -> None:
     broken: dict[str, dict[str, Any]] = {
         "a": good, "b": {**good, "x1": x1[:-1]}, "c": {**good, "x0": x0[:, :1]}, "d": {**good, "K0": K[:2]},
         "e": {**good, "size1": np.array([0, 640])}, "f": {**good, "x0": x0 > 0}, "g": {"x0": x0, "x1": x1, "K0": K},
-        "h": {**good, "K0": 0 * K}, "i": {**good, "x0": np.array([None])},
+        "h": {**good, "K0": 0 * K}, "i": {**good, "x0": np.array([None])}, "j": {"x0": x0}, "k": {"x1": x1},
     }  # fmt: skip
     arrays = {f"{pair}/{key}": value for pair, entries in broken.items() for key, value in entries.items()}
     result = fmtorch.verify(matches=save(tmp_path / "matches.npz", arrays), output=tmp_path / "verified.npz")
-    assert (result.pairs, result.verified) == (9, 1)
+    assert (result.pairs, result.verified) == (11, 1)
     said = (
         f"x0 has {len(x0)} points and x1 has {len(x1) - 1}; they must have as many",
         f"c/x0 has shape ({len(x0)}, 1); it must be (n, 2)",
         "d/K0 has shape (2, 3); it must be (3, 3)",
         "size1 is [0.0, 640.0]; it must be the height and width of the image",
         "f/x0 is of bool; it must hold real numbers",
-        *("K0 alone needs the image sizes", "K0", "i/x0 cannot be read"),
+        *("K0 alone needs the image sizes", "K0", "i/x0 cannot be read", "j/x1 is missing", "k/x0 is missing"),
     )
-    for line, pair, words in zip(sorted(result.problems), "bcdefghi", said, strict=True):
+    for line, pair, words in zip(sorted(result.problems), "bcdefghijk", said, strict=True):
         assert line.startswith(f"{pair}/x0, {pair}/x1: {words}")
     assert {key.partition("/")[0] for key in load(tmp_path / "verified.npz")} == {"a"}
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from fmtorch.estimators.external import pairwise
 from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Solution
+from fmtorch.estimators.refinement import Pixels
 
 USUAL_FOCAL = 1.2  # in units of the longer side, of a camera without a prior: COLMAP's default
 MAX_SEED = 2**31 - 1
@@ -14,7 +15,7 @@ Model = Literal["fundamental", "homography"]
 
 @pairwise.computed_by("pycolmap")
 def colmap(
-    *, threshold: float = 4.0, confidence: Confidence = 0.999, iterations: Iterations = 10000,
+    *, threshold: Pixels = 4.0, confidence: Confidence = 0.999, iterations: Iterations = 10000,
     min_iterations: int = 100, two_view: bool = True, model: Model = "fundamental",
 ) -> PairwiseEstimator:  # fmt: skip
     """COLMAP's estimators (Schoenberger & Frahm, CVPR 2016) with the defaults of its verification of matches.

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from fmtorch.core.options import Within
 from fmtorch.estimators.external import pairwise
 from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
+from fmtorch.estimators.refinement import Pixels
 from fmtorch.geometry.eight_point import eight_point
 from fmtorch.geometry.pose import calibrated
 
 
 def opencv(
-    *, method: str, threshold: float = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000,
-    essential: float | None = None,
+    *, method: str, threshold: Pixels = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000,
+    essential: Pixels | None = None,
 ) -> PairwiseEstimator:  # fmt: skip
     """`cv2.findFundamentalMat` with one of its robust methods.
 
@@ -91,7 +92,7 @@ def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> Pairw
 
 
 def kornia_ransac(
-    *, threshold: float = 1.0, confidence: Confidence = 0.9999, batch_size: int = 2048, rounds: int = 10,
+    *, threshold: Pixels = 1.0, confidence: Confidence = 0.9999, batch_size: int = 2048, rounds: int = 10,
     prosac: bool = True,
 ) -> PairwiseEstimator:  # fmt: skip
     """`kornia.geometry.RANSAC` with MSAC scores.
@@ -133,7 +134,7 @@ SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 
 @pairwise.computed_by("pymagsac")
 def magsac_cpp(
-    *, threshold: float = 3.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    *, threshold: Pixels = 3.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
     sampler: str = "adaptive",
 ) -> PairwiseEstimator:  # fmt: skip
     """MAGSAC++ by its authors (Barath et al., CVPR 2020), which draws its own random seed.
@@ -162,8 +163,8 @@ def magsac_cpp(
 
 @pairwise.computed_by("pygcransac")
 def gc_ransac_cpp(
-    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000, sampler: str = "prosac",
-    coherence: float = 0.975,
+    *, threshold: Pixels = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    sampler: str = "prosac", coherence: float = 0.975,
 ) -> PairwiseEstimator:  # fmt: skip
     """GC-RANSAC by its authors (Barath & Matas, CVPR 2018), which draws its own random seed.
 
@@ -194,7 +195,7 @@ def gc_ransac_cpp(
 
 @pairwise.computed_by("pydegensac")
 def degensac_cpp(
-    *, threshold: float = 0.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000
+    *, threshold: Pixels = 0.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000
 ) -> PairwiseEstimator:
     """DEGENSAC by its authors (Chum et al., CVPR 2005; Mishkin et al., 2015).
 
@@ -218,8 +219,8 @@ def degensac_cpp(
 
 @pairwise.computed_by("pysuperansac")
 def superansac_cpp(
-    *, threshold: float = 1.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000, sampler: str = "prosac",
-    score: str = "magsac",
+    *, threshold: Pixels = 1.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    sampler: str = "prosac", score: str = "magsac",
 ) -> PairwiseEstimator:  # fmt: skip
     """SupeRANSAC by its author (Barath, arXiv 2506.04803), with nested RANSAC and a final iterated least-squares fit.
 
@@ -267,8 +268,8 @@ LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "trunca
 
 @pairwise.computed_by("poselib")
 def poselib(
-    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
-    min_iterations: int = 1000, prosac: bool = False, loss: str | None = None, loss_scale: float | None = None,
+    *, threshold: Pixels = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    min_iterations: int = 1000, prosac: bool = False, loss: str | None = None, loss_scale: Pixels | None = None,
     real_focal_check: bool = False, shared_focal: bool = False,
 ) -> PairwiseEstimator:  # fmt: skip
     """PoseLib's LO-RANSAC for fundamental matrices, or for two cameras of one unknown focal length (Larsson 2020).
@@ -355,7 +356,7 @@ MODELS = ("fundamental", "homography")
 
 @pairwise.computed_by("fastpose")
 def fastpose(
-    *, threshold: float = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
+    *, threshold: Pixels = 1.0, confidence: Confidence = 0.9999, iterations: Iterations = 10000,
     min_iterations: int = 1000, model: str = "fundamental", focal: str | None = None,
 ) -> PairwiseEstimator:  # fmt: skip
     """fastpose's LO-RANSAC, whose kernels numba compiles at the first call.
