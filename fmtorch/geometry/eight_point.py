@@ -18,11 +18,9 @@ from fmtorch.jit.lanes import LANES, absolute, copysign, fill, load, sqrt, store
 
 
 def eight_point(
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    weight: Float[Tensor, "*batch n"] | None = None,
+    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
-) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:  # fmt: skip
     """The fundamental matrix of N >= 8 correspondences by weighted linear least squares, and whether it is valid.
 
     Points are normalised (Hartley, PAMI 1997; with the weights, so that a point of weight zero is as good as masked),

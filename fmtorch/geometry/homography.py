@@ -25,11 +25,9 @@ SINGULAR = 1e-12  # determinant of a matrix of unit norm, between normalised poi
 
 
 def homography(
-    x0: Float[Tensor, "*batch n 2"],
-    x1: Float[Tensor, "*batch n 2"],
-    weight: Float[Tensor, "*batch n"] | None = None,
+    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
-) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:  # fmt: skip
     """The homography of N >= 4 correspondences by weighted linear least squares, and whether it is valid.
 
     The normalised DLT (Hartley & Zisserman, algorithm 4.2), exact for four matches: H is the smallest eigenvector of

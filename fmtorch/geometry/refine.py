@@ -285,13 +285,9 @@ class Fits(NamedTuple):
 
 
 def reweighted_fits(
-    x0: Float[Tensor, "b n 2"],
-    x1: Float[Tensor, "b n 2"],
-    weigh: Weigh,
-    iterations: int,
-    mask: Bool[Tensor, "b n"] | None = None,
-    F0: Float[Tensor, "b 3 3"] | None = None,
-) -> Fits:
+    x0: Float[Tensor, "b n 2"], x1: Float[Tensor, "b n 2"], weigh: Weigh, iterations: int,
+    mask: Bool[Tensor, "b n"] | None = None, F0: Float[Tensor, "b 3 3"] | None = None,
+) -> Fits:  # fmt: skip
     """Iterated weighted 8-point fits whose weights any function predicts from the last fit and its residuals.
 
     The iteration of Ranftl & Koltun, Deep fundamental matrix estimation, ECCV 2018, section 3.2, where `weigh` is a

@@ -252,13 +252,10 @@ class Neighbors(NamedTuple):
 
 @torch.no_grad()
 def nearest_neighbors(
-    descriptors0: Float[Tensor, "*batch n0 d"],
-    descriptors1: Float[Tensor, "*batch n1 d"],
-    mask0: Bool[Tensor, "*batch n0"] | None = None,
-    mask1: Bool[Tensor, "*batch n1"] | None = None,
-    *,
+    descriptors0: Float[Tensor, "*batch n0 d"], descriptors1: Float[Tensor, "*batch n1 d"],
+    mask0: Bool[Tensor, "*batch n0"] | None = None, mask1: Bool[Tensor, "*batch n1"] | None = None, *,
     chunk: int = 1024,
-) -> Neighbors:
+) -> Neighbors:  # fmt: skip
     """The two nearest descriptors of image 1 for each of image 0, and the nearest the other way, in one pass.
     Squared distances are computed as integers, so no rounding can depend on the batch, the block or the device: integer
     descriptors such as SIFT's are taken as they are, others on a grid of 2^-25 of the longest descriptor of the pair.

@@ -198,15 +198,10 @@ def inlier_rate(
 
 @checked
 def ground_truth_inliers(
-    F_gt: Float[Tensor, "*#batch 3 3"],
-    x0: Float[Tensor, "*#batch n 2"],
-    x1: Float[Tensor, "*#batch n 2"],
-    size0: Real[Tensor, "*#batch 2"],
-    size1: Real[Tensor, "*#batch 2"],
-    *,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    threshold: float = DIAGONALS,
-) -> Bool[Tensor, "*#batch n"]:
+    F_gt: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"],
+    size0: Real[Tensor, "*#batch 2"], size1: Real[Tensor, "*#batch 2"], *,
+    mask: Bool[Tensor, "*#batch n"] | None = None, threshold: float = DIAGONALS,
+) -> Bool[Tensor, "*#batch n"]:  # fmt: skip
     """Matches whose two distances to their true epipolar lines are both below `threshold` image diagonals.
 
     No match is one where F_gt is zero or not finite.
@@ -236,13 +231,9 @@ MATCH_THRESHOLD = 3.0  # px, of right matches, as LightGlue's table of HPatches 
 
 @checked
 def right_of_homography(
-    H_gt: Float[Tensor, "*#batch 3 3"],
-    x0: Float[Tensor, "*#batch n 2"],
-    x1: Float[Tensor, "*#batch n 2"],
-    *,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    threshold: float = MATCH_THRESHOLD,
-) -> Bool[Tensor, "*#batch n"]:
+    H_gt: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"], *,
+    mask: Bool[Tensor, "*#batch n"] | None = None, threshold: float = MATCH_THRESHOLD,
+) -> Bool[Tensor, "*#batch n"]:  # fmt: skip
     """Matches whose transfer distances under the true homography, in both images, have a mean below the threshold.
 
     Args:

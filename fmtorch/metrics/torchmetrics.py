@@ -54,13 +54,9 @@ class NSGD(_MeanOverPairs):
         self.samples, self.seed = samples, seed
 
     def update(  # type: ignore[override]
-        self,
-        F_gt: Float[Tensor, "b 3 3"],
-        F_est: Float[Tensor, "b 3 3"],
-        size0: Real[Tensor, "b 2"],
-        size1: Real[Tensor, "b 2"],
-        key: Int[Tensor, " b"] | None = None,
-    ) -> None:
+        self, F_gt: Float[Tensor, "b 3 3"], F_est: Float[Tensor, "b 3 3"], size0: Real[Tensor, "b 2"],
+        size1: Real[Tensor, "b 2"], key: Int[Tensor, " b"] | None = None,
+    ) -> None:  # fmt: skip
         """Adds a batch; arguments as `fmtorch.metrics.nsgd`."""
         super().update(nsgd(F_gt, F_est, size0, size1, samples=self.samples, seed=self.seed, key=key))
 

@@ -125,13 +125,9 @@ def evenly(index: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:
 
 
 def huber_regression(
-    basis: Float[Tensor, "n m"],
-    target: Float[Tensor, "n k"],
-    ridge: Float[Tensor, "m m"],
-    *,
-    scale: float,
+    basis: Float[Tensor, "n m"], target: Float[Tensor, "n k"], ridge: Float[Tensor, "m m"], *, scale: float,
     iterations: int,
-) -> Float[Tensor, "m k"]:
+) -> Float[Tensor, "m k"]:  # fmt: skip
     """The coefficients C (m, k) that minimise ``sum_j huber(|target_j - basis_j C|) + tr(C^T ridge C)``.
     Huber's loss is quadratic up to `scale` and linear beyond; a row of the target counts by its length. Starts from C =
     0. Each iteration weights the rows by their residuals and solves the normal equations, which are summed in the type
