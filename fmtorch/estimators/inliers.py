@@ -100,8 +100,7 @@ COARSE_SHARE = 0.2  # of the matches within a distance: that many between it and
 
 def coarse(r2: Array) -> bool:
     """Whether matches are coarser than usual, by their squared residuals (n,), px^2, of matches of usual noise: by how
-    many lie between one and two of their usual distance, but for those that do by accident, as between four and eight.
-    Of Gaussian noise above 1.1 px they are; sharp keypoints of photographs have 0.1 to 0.7 px."""
+    many lie between one and two of their usual distance (0.2: noise of 1.1 px), but for those that do by accident."""
     one, two, four, eight = (int(np.count_nonzero(r2 <= squared(k * USUAL_PX))) for k in (1, 2, 4, 8))
     return one >= MIN_INLIERS_FOR_NOISE and two - one - (eight - four) / 4 > COARSE_SHARE * one
 

@@ -62,7 +62,7 @@ def find_fundamental(
             the leading B for one pair, and comes as a list where the points do.
         ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
         score: (B, N), the matcher's confidence in [0, 1], larger is better, NaN as 0; used where there is no ratio.
-            Whether it is a probability, as LightGlue's, the matches of each pair tell; otherwise it ranks them alone.
+            Whether it is a probability, as LightGlue's, the matches of each pair tell; `fmtorch` ignores others.
         prior: (B, N), P(inlier) in [0, 1], NaN as 0. Where an estimator uses a prior and none is given, it is derived
             from the frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.

@@ -23,6 +23,7 @@ from fmtorch.jobs.execution import one_thread
 from fmtorch.two_view.arguments import camera_problems
 
 OFF_CENTRE = 0.1  # of a principal point, in units of the side, or beyond twice it a point: K may be of another image
+PROMISED = 1.25  # right matches that the prior expects, times the inliers, from which on K is doubted; mostly 1
 MORE, MORE_MATCHES = 1.1, 8  # inliers without K, times those with it and beyond, from which on it is contradicted
 
 
@@ -60,10 +61,14 @@ class KnownCameras:
     @torch.no_grad()
     def _compared(self, c: Correspondences, square: Correspondences, known: Estimate, seed: int) -> Estimate:
         """The estimate with which calibrations its matches contradict: of those whose principal points may be of other
-        images, or that suggest a lens, the ones of far more inliers without K than with K, and than with that lens."""
+        images, that suggest a lens, or of fewer inliers than the prior promises, the ones of far more inliers without K
+        than with K, and than with that lens."""
         rows, wrong, suggested = _off_centre(c), torch.zeros_like(known.ok), known.lens_suggested
         if suggested is not None:
             rows |= suggested.isfinite()
+        if square.prior is not None:
+            promised = torch.where(square.mask, square.prior.detach(), 0).sum(1)
+            rows |= promised > PROMISED * known.inliers.sum(1)
         if not bool(rows.any()):
             return known.derived(contradicted=wrong)
         alone = c.detach()[rows].derived(K0=None, K1=None, focal=None, shared_focal=None)

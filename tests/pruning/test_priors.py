@@ -57,9 +57,8 @@ def by_score(evidence: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
 def test_scores_are_taken_for_probabilities_only_where_they_are_like_the_agreement() -> None:
     generator = torch.Generator().manual_seed(0)
     evidence, mask = torch.rand(4, 40, generator=generator), torch.ones(4, 40, dtype=torch.bool)
-    few, equal = evidence[2] / 100, torch.full((40,), 0.2)
-    score = torch.stack([(evidence[0] / 2).clamp(0.01), torch.linspace(0, 1, 40), few, equal])
-    mask[1, 25:] = False
+    rows = (evidence[0] / 2).clamp(0.01), torch.linspace(0, 1, 40), evidence[2] / 100, torch.full((40,), 0.2)
+    score, mask[1, 25:] = torch.stack(rows), False
     c = scene(0, 40).replace(prior=None, ratio=None)
     c = Correspondences(c.x0.expand(4, -1, -1), c.x1.expand(4, -1, -1), mask, score=torch.where(mask, score, torch.nan))
     expected = torch.stack([by_score(evidence[i], score[i]) for i in (0, 2, 3)])

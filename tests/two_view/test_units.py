@@ -234,12 +234,13 @@ def test_the_principal_point_of_a_crop_may_lie_outside(sizes: dict[str, tuple[in
     assert bool(batch.ok.all())
 
 
-def test_calibrations_of_another_resolution_are_doubted() -> None:
+def test_calibrations_of_another_resolution_or_focal_length_are_doubted() -> None:
     """Their pose is off by many degrees, though some matches agree with it."""
     quarter = [np.diag([0.25, 0.25, 1]) @ K for K in (K0, K1)]
-    for sizes in ({}, {"size0": SIZE, "size1": SIZE}):
+    shorter = [K0 * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]], K1]
+    for Ks, sizes in ((quarter, {}), (quarter, SIZES), (shorter, SIZES)):
         with pytest.warns(UserWarning, match="pair 0: far more matches agree without the calibration matrices"):
-            wrong = fmtorch.find_essential(X0, X1, *quarter, **sizes)
+            wrong = fmtorch.find_essential(X0, X1, *Ks, **sizes)
         assert "another resolution" in wrong.warning[0]
         assert angle(wrong.R[0].numpy(), SCENE.R) > 2
     both = [[K, wrong] for K, wrong in zip((K0, K1), quarter, strict=True)]
