@@ -19,7 +19,7 @@ from fmtorch.estimators.models.fundamental import FitScale
 from fmtorch.estimators.models.posterior import Cameras, Images, Limits, centred, images_of, tangents_of, translate
 from fmtorch.estimators.models.with_focals import gain_without_prior
 from fmtorch.estimators.pair import Lens, Pair, squared
-from fmtorch.estimators.refinement import FOCAL_TOLERANCE, PRIOR_CONFLICT_GAIN, Fit, LensFit, measured
+from fmtorch.estimators.refinement import FOCAL_TOLERANCE, PRIOR_CONFLICT_GAIN, Fit, LensFit
 from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, minimiser, rows_of, summation
 from fmtorch.geometry.matrices import assign
@@ -373,7 +373,7 @@ def lens_fit(lens: Array, cameras: Cameras, pair: Pair, inliers: Array) -> Fit:
 
 def _straight_evidence(fit: LensFit, pair: Pair) -> float:
     """That of pinholes, or of a fundamental matrix without plausible cameras, as of crops, if that is greater."""
-    if measured(pair):
+    if pair.calibration is not None:
         return fit.evidence
     gain, cameras = np.empty(1), slice(LENS)
     derivatives = np.ascontiguousarray(fit.hessian[cameras, cameras]), fit.gradient[cameras]

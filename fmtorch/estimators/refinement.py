@@ -260,19 +260,13 @@ class Adaptive(NoFit):
             precision = squared(pair.pixels_per_unit / (scale / own.scale_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
             F, cameras, gain = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
-            agreed = measured(pair) or gain <= PRIOR_CONFLICT_GAIN
+            agreed = pair.calibration is not None or gain <= PRIOR_CONFLICT_GAIN
             if agreed and all(map(math.isfinite, F.tolist())):
                 return Fit(F, F, within(F, pair, scale), cameras, precision)
         (F,) = family.refine(selection.F[None], pair, own.loss, scale, SCHEDULE)
         if own.loss == "cauchy":
             return Fit(F, F, np.ones(pair.count), s2=np.square(scale / pair.pixels_per_noise))
         return Fit(F, F, within(F, pair, scale))
-
-
-def measured(pair: Pair) -> bool:
-    """Whether both focal lengths are, or are one: then no prior on usual ones is dropped."""
-    known = pair.calibration
-    return known is not None and (known.shared or math.isfinite(max(known.deviations)))
 
 
 def within(F: Array, pair: Pair, scale: float) -> Array:
