@@ -262,19 +262,21 @@ class Ransac:
             np.sqrt(pair.match_weight, out=pair.match_weight)
         if pair.lens is not None:
             return self._with_lenses(pair, pair.lens)
-        solution, times = self._of_one_scale(pair), 1
+        solution, scaled, times = self._of_one_scale(pair), pair, 1
         while times < self.coarsest and solution.fit is not None:
             F, samples = solution.fit.F, solution.samples
-            if not inliers.coarse(squared_in_noises(F, across_lines(pair.reduced(times), F))):
+            if not inliers.coarse(squared_in_noises(F, across_lines(scaled, F))):
                 break
             times *= 2
-            coarser = self._of_one_scale(pair.reduced(times))
+            scaled = pair.reduced(times)
+            coarser = self._of_one_scale(scaled)
             if coarser.fit is None:
                 break
             solution = coarser._replace(samples=samples + coarser.samples)
         if times == 1 or solution.fit is None:
             return solution
-        seen, F = across_lines(pair, solution.fit.F), solution.fit.F
+        F = solution.fit.F
+        seen = across_lines(pair, F)
         return solution._replace(inliers=self.inliers(F, seen), pair=None if pair.stretch is None else seen)
 
     def _of_one_scale(self, pair: Pair) -> Solution:

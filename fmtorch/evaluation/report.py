@@ -388,7 +388,7 @@ def find_dataset(stored: Row, options: Options) -> PairDataset:
                 return dataset
             reasons.append("the data set has changed since the run, or another one lies in root")
         except _NOT_BUILT as error:
-            reasons.append(str(error).replace("dataset.truth=SET", "root=[FILES,SET]"))  # as a report takes it
+            reasons.append(str(error))
     raise DataError("; ".join(dict.fromkeys(reasons)))
 
 

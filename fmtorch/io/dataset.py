@@ -251,7 +251,9 @@ class H5Pairs(HeldPairs):
         else:
             _expect_unset(layout, images=images)
             if truth is None:
-                needed = "give dataset.truth=SET, where SET is the `fmbench` set that it was computed on"
+                needed = (
+                    "give dataset.truth=SET (a report: root=[FILES,SET]), the `fmbench` set that it was computed on"
+                )
                 raise DataError(f"layout {layout} holds no geometry: {needed}")
             known = FMBenchPairs(truth)
             digest.update(known.digest.encode())
