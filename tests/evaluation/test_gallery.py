@@ -107,7 +107,7 @@ def test_each_data_set_is_found_in_its_own_root(tmp_path: Path) -> None:
         find_dataset({**presets.load("dataset", "fmbench"), "digest": "other"}, Options(1))
     with pytest.raises(DataError, match="one of your own, which a report loads with own_code=true"):
         find_dataset({"_target_": "pathlib.Path.touch"}, Options(1, roots))
-    with pytest.raises(DataError, match=r"layout hloc holds no geometry: give root=\[FILES,SET\], where SET is"):
+    with pytest.raises(DataError, match=r"layout hloc holds no geometry: .* \(a report: root=\[FILES,SET\]\)"):
         find_dataset({**presets.load("dataset", "h5"), "layout": "hloc"}, Options(1, roots[:1]))
     # A root of another data set does not hide one that needs none.
     assert len(find_dataset(presets.load("dataset", "stereo"), Options(1, roots))) == 1
