@@ -111,22 +111,17 @@ class FocalSearch:
         Rounds are made until good candidates are one model, or enough rounds have confirmed the best one, and the
         stopping rule is content. The best one is the estimate if that rule is content and the images have one size, or
         if anything is known of the cameras."""
-        options, confirmations, stop = self.options, 0, False
-        candidates: PlausibleCandidates | None = None
-        draws = 0
-        for turn in range(options.rounds):
-            new, draws = self.round(pair, turn)
-            if candidates is None:
-                candidates = new
-            else:
-                confirmations += candidates.confirmed(new)
-                candidates = candidates.joined(new)
+        options, confirmations, rounds = self.options, 0, 1
+        candidates, draws = self.round(pair, 0)
+        while True:
             best = candidates.F[candidates.best]
             stop = self.stop is not None and candidates.valid and self.stop(best, draws, pair, self.family.size)
             agreed = candidates.unique_optimum or confirmations >= options.confirmations
-            if turn + 1 >= options.min_rounds and agreed and stop:
+            if rounds >= options.rounds or (rounds >= options.min_rounds and agreed and stop):
                 break
-        assert candidates is not None
+            new, draws = self.round(pair, rounds)
+            confirmations += candidates.confirmed(new)
+            candidates, rounds = candidates.joined(new), rounds + 1
         if candidates.valid and self.choice.at_noise is not None:
             candidates = candidates.judged(self.choice.of_pair(candidates.F[candidates.best], pair), pair)
         return candidates, pair.calibration is not None or (pair.same_size and stop), draws
@@ -147,20 +142,17 @@ class FocalSearch:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
         Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
         they are tried where good models differ or some were there before, and taken where cameras are known."""
-        known = pair.calibration is not None
-        best = self.choice.first(free, pair).F if plausible is None else plausible.F[plausible.best]
-        score = self.choice.of_pair(best, pair)
+        known, before = pair.calibration is not None, None if plausible is None else plausible.best_alone()
+        score = self.choice.of_pair(self.choice.first(free, pair).F if before is None else before.F[0], pair)
         gain = np.where(free.valid, scores_of(score, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")
         models, gain = free.F[order], gain[order]
-        selection = Selection(models[0], free.valid)
-        if plausible is None and not known and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
+        selection = Selection(models[0], free.valid or (before is not None and before.valid))
+        if before is None and not known and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
             return selection
         tried = slice(self.options.candidates)
         candidates = self.refined(models[tried], np.isfinite(gain[tried]), free.near)
-        if plausible is not None:
-            candidates = candidates.joined(plausible)
-        candidates = candidates.judged(score, pair)
+        candidates = (candidates if before is None else candidates.joined(before)).judged(score, pair)
         believed = candidates.posterior[candidates.best] >= MIN_GAIN_SHARE * gain[0]
         if not (believed or (known and candidates.valid)):
             return selection

@@ -100,9 +100,9 @@ class Pair:
 
     @property
     def same_size(self) -> bool:
-        """Whether both images have one size. Of a pair whose sizes are known."""
+        """Whether both images have one size, upright or turned. Of a pair whose sizes are known."""
         h0, w0, h1, w1 = self.sizes.tolist()
-        return bool(h0 == h1 and w0 == w1)
+        return bool(sorted((h0, w0)) == sorted((h1, w1)))
 
     @property
     def noises(self) -> Array:

@@ -16,7 +16,7 @@ from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators import focal_search, inliers, lens_search, preselection, refinement, sampling, scores
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution
-from fmtorch.estimators.focal_search import Focal, FocalSearch, PlausibleCandidates
+from fmtorch.estimators.focal_search import Focal, FocalSearch
 from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, noise_scale, residuals_squared_px, squared_in_noises
@@ -289,16 +289,35 @@ class Ransac:
     def _of_pinholes(self, pair: Pair) -> Solution:
         """Where cameras are calibrated and all but still, the search is repeated without the matches of outlying
         parallax, and what it finds is taken if it loses no more of these than may be inliers by accident."""
-        first = self._fitted(pair, *self.selected(searched(pair)))
+        first = self._searched(pair, searched(pair))
         outlying = focal_search.outlying(first.fit, first.inliers, pair)
         if outlying is None or first.inliers is None:
             return first
-        second = self._fitted(pair, *self.selected(searched(pair.ignoring(outlying))))
+        second = self._searched(pair, searched(pair.ignoring(outlying)))
         if second.inliers is None:
             return first
         accidental = ACCIDENTAL + ACCIDENTAL_SHARE * (pair.count - np.count_nonzero(first.inliers))
         better = np.count_nonzero(outlying & first.inliers & ~second.inliers) <= accidental
         return (second if better else first)._replace(samples=first.samples + second.samples)
+
+    def _searched(self, pair: Pair, near: Pair) -> Solution:
+        """Search to fit, the search among some matches: of plausible cameras first where the image sizes are known, and
+        without assumptions where these are doubtful."""
+        plausible, draws, focal = None, 0, self.focal if pair.sizes_known else None
+        if focal is not None and focal.search is not None:
+            plausible, settled, draws = focal(near)
+            if settled:
+                solution = self._fitted(pair, plausible.selection, draws)
+                if (
+                    pair.calibration is not None
+                    or solution.fit is None
+                    or solution.fit.gain <= refinement.DOUBTFUL_GAIN
+                ):
+                    return solution
+        pool = self.search(near)
+        free = self.refine(pool, near, self.family)
+        selection = self.select(free, near) if focal is None else focal.select(free, near, plausible)
+        return self._fitted(pair, selection, draws + pool.samples)
 
     def _fitted(self, pair: Pair, selection: refinement.Selection, draws: int) -> Solution:
         if not selection.valid:
@@ -327,23 +346,6 @@ class Ransac:
                 return Solution(fit, solution.samples, inliers, lens=fit.lens.lens, deviation=fit.lens.deviation)
         free = solution.fit._replace(counted=np.zeros(pair.count))  # without cameras there are no gradients
         return solution._replace(lens=lens, fit=free)
-
-    def selected(self, pair: Pair) -> tuple[refinement.Selection, int]:
-        """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""
-        if self.focal is None or not pair.sizes_known:
-            pool = self.search(pair)
-            return self.select(self.refine(pool, pair, self.family), pair), pool.samples
-        plausible: PlausibleCandidates | None = None
-        draws = 0
-        if self.focal.search is not None:
-            candidates, settled, draws = self.focal(pair)
-            if settled:
-                return candidates.selection, draws
-            plausible = candidates.best_alone()
-        pool = self.search(pair)
-        selection = self.focal.select(self.refine(pool, pair, self.family), pair, plausible)
-        valid = selection.valid or (plausible is not None and plausible.valid)
-        return selection._replace(valid=valid), draws + pool.samples
 
     def inliers(self, F: Array, pair: Pair) -> Array:
         """The inliers (n,) of a model (9,)."""

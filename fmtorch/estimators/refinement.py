@@ -166,6 +166,7 @@ def scores_of(score: Score, F: Array, pair: Pair) -> Array:
 
 SCHEDULE = Schedule(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
 PRIOR_CONFLICT_GAIN = 4.0  # what an optimum without prior may gain, in logarithms of the likelihood, before it is taken
+DOUBTFUL_GAIN = 2.0  # the same, before models without prior are searched, and lenses
 FOCAL_ITERATIONS = 5  # Levenberg-Marquardt steps where cameras are assumed: these start nearer
 FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standard deviation more or less
 
@@ -190,7 +191,8 @@ class Fit(NamedTuple):
     F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
     there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of
     an inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's
-    loss in that unit, where it is the fit's. lens: of photographs that are bent, its last fit."""
+    loss in that unit, where it is the fit's. lens: of photographs that are bent, its last fit. gain: of the logarithm
+    of the likelihood without the prior on cameras that nobody calibrated."""
 
     F: Array
     at: Array
@@ -199,6 +201,7 @@ class Fit(NamedTuple):
     precision: float = 0.0
     s2: Array | None = None
     lens: LensFit | None = None
+    gain: float = 0.0
 
 
 class NoFit:
@@ -255,18 +258,18 @@ class Adaptive(NoFit):
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Matrices) -> Fit:
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
         own = family.fit_scale
-        scale = fit_distance(squared_in_noises(selection.F, pair)[likely], own)
+        scale, gain = fit_distance(squared_in_noises(selection.F, pair)[likely], own), 0.0
         if selection.cameras is not None:
             precision = squared(pair.pixels_per_unit / (scale / own.scale_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
             F, cameras, gain = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
-            agreed = pair.calibration is not None or gain <= PRIOR_CONFLICT_GAIN
-            if agreed and all(map(math.isfinite, F.tolist())):
-                return Fit(F, F, within(F, pair, scale), cameras, precision)
+            gain = 0.0 if pair.calibration is not None else gain
+            if gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, F.tolist())):
+                return Fit(F, F, within(F, pair, scale), cameras, precision, gain=gain)
         (F,) = family.refine(selection.F[None], pair, own.loss, scale, SCHEDULE)
         if own.loss == "cauchy":
             return Fit(F, F, np.ones(pair.count), s2=np.square(scale / pair.pixels_per_noise))
-        return Fit(F, F, within(F, pair, scale))
+        return Fit(F, F, within(F, pair, scale), gain=gain)
 
 
 def within(F: Array, pair: Pair, scale: float) -> Array:

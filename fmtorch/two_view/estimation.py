@@ -135,6 +135,7 @@ MIN_MATCHES = 20  # fewer say little of where an image ends
 BORDER = -1.0  # px: coordinates below are not those of a photograph
 MARGIN = 1.5  # of the extent over the number of points, by which the last point of evenly spread ones is off the border
 SAME_SIZE = 1.1  # ratio of extents up to which images have one size
+SQUARE = 1.2  # ratio of the sides of one size for both images, below which one of them is rather upright
 TWO_SIZES_GAIN = 3.0  # of significance, from which on images have two
 
 
@@ -170,10 +171,14 @@ def with_assumed_sizes(c: Correspondences, estimate: Callable[[Correspondences],
     """The better estimate of each pair, with `sizes` and `sizes_doubtful`. estimate: of a batch, with significance.
 
     Keypoints reach near the border. Two images mostly come from one camera, so that the farther point of both tells the
-    size of either. Where their extents differ by more than that, two sizes are tried as well, and the estimate that is
-    more significant is taken. Pairs whose points tell no sizes are estimated without."""
+    size of either; if one image is upright, that of their long and short sides. Where their extents differ by more than
+    that, two sizes are tried as well, and the estimate that is more significant is taken. Pairs whose points tell no
+    sizes are estimated without."""
     own, known = extents(c)
-    same = own.amax(1, keepdim=True).expand(-1, 2, -1)
+    square = own.amax(1).amax(1) < SQUARE * own.amax(1).amin(1)
+    turned = (square & (own[..., 0] > own[..., 1]).sum(1).eq(1))[:, None]
+    one = torch.maximum(own[:, 0], torch.where(turned, own[:, 1].flip(-1), own[:, 1]))
+    same = torch.stack([one, torch.where(turned, one.flip(-1), one)], 1)
     doubtful = known & (same > SAME_SIZE * own).flatten(1).any(1)
     kinds = [(known, same), (~known, own), (doubtful, own)]
     tried = [(rows, sizes) for rows, sizes in kinds if bool(rows.any())] or kinds[1:2]

@@ -22,6 +22,9 @@ def extents(x0: np.ndarray, x1: np.ndarray) -> Sizes | None:
 def assumed(sizes: Sizes, one_size: float, two_sizes: float) -> tuple[Sizes, bool]:
     """The sizes that are taken, and whether they are doubtful; of the significance of estimates of one size and two."""
     (h0, w0), (h1, w1) = sizes
-    h, w = max(h0, h1), max(w0, w1)
-    doubtful = max(h / h0, h / h1, w / w0, w / w1) > 1.1
-    return (sizes if doubtful and two_sizes > one_size + 3 else [(h, w), (h, w)]), doubtful
+    same = [(max(h0, h1), max(w0, w1))] * 2
+    if (h0 > w0) != (h1 > w1) and max(same[0]) < 1.2 * min(same[0]):  # one upright, one not
+        long, short = max(h0, w0, h1, w1), max(min(h0, w0), min(h1, w1))
+        same = [(long, short) if h > w else (short, long) for h, w in sizes]
+    doubtful = any(a / b > 1.1 for one, own in zip(same, sizes, strict=True) for a, b in zip(one, own, strict=True))
+    return (sizes if doubtful and two_sizes > one_size + 3 else same), doubtful

@@ -35,7 +35,7 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     """What the two focal lengths cost; less where images of equal size may be of one camera.
     measured: logarithm and deviation of each; an infinite deviation is no measurement."""
     difference = log_f0 - log_f1
-    well = 5 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
+    well = 3 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
     cost = (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
     z2 = 0.0  # of measurements that may both be wrong
     for log_f, (mean, deviation) in zip((log_f0, log_f1), measured, strict=True):

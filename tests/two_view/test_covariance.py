@@ -189,15 +189,19 @@ def test_extents_are_those_of_the_reference() -> None:
             torch.testing.assert_close(sizes[i], torch.tensor(expected, dtype=torch.float64), rtol=1e-15, atol=0)
 
 
-def test_the_estimate_is_that_of_the_sizes_that_are_assumed() -> None:
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_estimate_is_that_of_the_sizes_that_are_assumed(turned: bool) -> None:
     x0, x1 = points(0)
+    x0 = np.stack([x0[:, 1], SIZE[1] - 1 - x0[:, 0]], 1) if turned else x0  # image 0 upright
     estimate = found(x0, x1)
     (size, other), said = estimate.sizes[0], assumed_sizes.extents(x0, x1)
-    assert size.tolist() == other.tolist() == pytest.approx(assumed_sizes.assumed(said, 0, 0)[0][0])
-    assert (size > torch.tensor(SIZE) * 0.9).all()
-    assert (size < torch.tensor(SIZE) * 1.1).all()
-    assert torch.equal(estimate.F, found(x0, x1, size0=size, size1=size).F)
+    assert size.tolist() == (other.flip(0) if turned else other).tolist()
+    assert size.tolist() == pytest.approx(assumed_sizes.assumed(said, 0, 0)[0][0])
+    torch.testing.assert_close(other, torch.tensor(SIZE, dtype=torch.float64), rtol=0.1, atol=0)
+    assert torch.equal(estimate.F, found(x0, x1, size0=size, size1=other).F)
+    assert int(estimate.samples) < 1000  # both are of one camera, so that samples of seven are not looked at
     assert not torch.equal(estimate.F, found(x0, x1, size0="unknown").F)
+    assert fmtorch.find_fundamental(x0, x1, estimator="ransac").sizes is None
     assert estimate.warning == ("",)
 
 
@@ -205,11 +209,10 @@ def test_the_estimate_is_that_of_the_sizes_that_are_assumed() -> None:
 def test_images_of_one_size_or_of_two_by_their_significance(scale: float) -> None:
     x0, x1 = points(1, scale)
     x0, x1 = (x0[x0[:, 0] < 320], x1[x0[:, 0] < 320]) if scale == 1 else (x0, x1)
-    own = assumed_sizes.extents(x0, x1)
+    own, estimate = assumed_sizes.extents(x0, x1), found(x0, x1)
     same = [max(size) for size in zip(*own, strict=True)]
     both = [found(x0, x1, size0=size0, size1=size1) for size0, size1 in ((same, same), own)]
     sizes, doubtful = assumed_sizes.assumed(own, *(float(e.significance[0]) for e in both))
-    estimate = found(x0, x1)
     assert doubtful
     assert estimate.sizes[0].tolist() == pytest.approx(np.array(sizes), rel=1e-15)
     assert any(torch.equal(estimate.F, e.F) for e in both)
@@ -248,12 +251,6 @@ def test_opencv_is_given_them_unasked() -> None:
     F, _ = cv2.findFundamentalMat(x0, x1, opencv.FM_RANSAC, 3.0)
     expected = fmtorch.find_fundamental(x0, x1, inlier_threshold=3.0)
     np.testing.assert_allclose(F / np.linalg.norm(F), expected.F[0].numpy(), atol=1e-12)
-
-
-def test_other_estimators_assume_nothing() -> None:
-    x0, x1 = points(0)
-    assert fmtorch.find_fundamental(x0, x1, estimator="ransac").sizes is None
-    assert found(x0, x1, size0=SIZE, size1=SIZE).sizes is None
 
 
 @pytest.mark.parametrize(("wrong", "far"), [(0, 0), (60, 0), (100, 0), (60, 120)])

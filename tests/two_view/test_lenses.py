@@ -336,7 +336,8 @@ def test_what_stands_in_masked_slots_means_nothing(find: Any, garbage: float) ->
         estimate.matrix.sum().backward()
         gradients.append((estimate.matrix.detach(), *(x.grad[:, : len(x0)] for x in points)))
         assert all(float(x.grad[:, len(x0) :].abs().sum()) == 0 for x in points)
-    assert all(map(torch.equal, *gradients))
+    assert torch.equal(gradients[0][0], gradients[1][0])
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-16)  # whose sums have other last bits
 
 
 def test_frames_go_with_their_points() -> None:

@@ -426,13 +426,12 @@ def test_gradients_of_lenses_are_differences_of_optima(lens: Any, cameras: str, 
 
 def test_a_lens_without_plausible_cameras_has_no_gradients(monkeypatch: Any) -> None:
     """As of crops, whose points would have to be undistorted in the graph."""
-    selected = Ransac.selected
+    fitted = Ransac._fitted
 
-    def free(self: Ransac, pair: Any) -> Any:
-        selection, draws = selected(self, pair)
-        return selection._replace(cameras=None), draws
+    def free(self: Ransac, pair: Any, selection: Any, draws: int) -> Any:
+        return fitted(self, pair, selection._replace(cameras=None), draws)
 
-    monkeypatch.setattr(Ransac, "selected", free)
+    monkeypatch.setattr(Ransac, "_fitted", free)
     x0, x1, F, _ = division.photographs(1, (-0.15, -0.15))
     attached = torch.from_numpy(x0).requires_grad_()
     estimate = found(attached, x1, lens=-0.15)

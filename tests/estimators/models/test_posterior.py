@@ -132,7 +132,7 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     pair, px = pair_of(c), 1.0
     precision, matches = (pair.pixels_per_unit / (px / 2)) ** 2, posterior.centred(pair_of(c), px)
     begin, _ = FAMILY.refine(to_units(truth, pair)[None], pair, 12)
-    begin.focal[0] += [0.1, -0.1]
+    begin.focal[0] += [-0.15, 0.15]
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
     before = evaluated(begin, pair, "truncated", px, precision)
     out = posterior.start_at(begin.copy())
