@@ -242,45 +242,41 @@ class Ransac:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        calibrated = None if self.focal is None else CALIBRATED_MATCHES
-        estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
+        estimation = Estimation(c, seed, self.family, self.family.size, CALIBRATED_MATCHES if self.focal else None)
 
         def estimate_part(part: Sequence[int]) -> None:
             with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
                 for row in estimation.rows(part):
                     estimation.put(row, self.estimate(row.pair))
 
-        if len(estimation.parts) > 1:
-            mapped(estimate_part, estimation.parts)
-        else:
-            estimate_part(estimation.parts[0])
+        each = mapped if len(estimation.parts) > 1 else map
+        list(each(estimate_part, estimation.parts))
         return estimation.estimates(Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair, which is the search's own."""
         if self.focal is not None and self.focal.options.sqrt_prior and pair.sizes_known:
             np.sqrt(pair.match_weight, out=pair.match_weight)
-        if pair.lens is not None:
-            return self._with_lenses(pair, pair.lens)
-        solution, scaled, times = self._of_one_scale(pair), pair, 1
+        solution, times = self._of_one_scale(pair), 1
         while times < self.coarsest and solution.fit is not None:
-            F, samples = solution.fit.F, solution.samples
-            if not inliers.coarse(squared_in_noises(F, across_lines(scaled, F))):
+            r2, noise = _distances(solution.fit, solution.lens, pair)
+            if not inliers.coarse(r2 / np.square(times * noise)):
                 break
             times *= 2
-            scaled = pair.reduced(times)
-            coarser = self._of_one_scale(scaled)
+            coarser = self._of_one_scale(pair.reduced(times))
             if coarser.fit is None:
                 break
-            solution = coarser._replace(samples=samples + coarser.samples)
+            solution = coarser._replace(samples=solution.samples + coarser.samples)
         if times == 1 or solution.fit is None:
             return solution
-        F = solution.fit.F
-        seen = across_lines(pair, F)
-        return solution._replace(inliers=self.inliers(F, seen), pair=None if pair.stretch is None else seen)
+        near = self.inlier_rule(_distances(solution.fit, solution.lens, pair)[0], pair)
+        seen = None if pair.stretch is None else across_lines(pair, solution.fit.F)
+        return solution._replace(inliers=near, pair=seen)
 
     def _of_one_scale(self, pair: Pair) -> Solution:
-        """The same of pinholes, at the distances in pixels of the options."""
+        """The same at the distances in pixels of the options."""
+        if pair.lens is not None:
+            return self._with_lenses(pair, pair.lens)
         solution = self._of_pinholes(pair)
         if self.focal is None or solution.fit is None or not pair.sizes_known:
             return solution
@@ -308,11 +304,7 @@ class Ransac:
             plausible, settled, draws = focal(near)
             if settled:
                 solution = self._fitted(pair, plausible.selection, draws)
-                if (
-                    pair.calibration is not None
-                    or solution.fit is None
-                    or solution.fit.gain <= refinement.DOUBTFUL_GAIN
-                ):
+                if solution.fit is None or solution.fit.gain <= refinement.DOUBTFUL_GAIN:
                     return solution
         pool = self.search(near)
         free = self.refine(pool, near, self.family)
@@ -366,6 +358,14 @@ def searched(pair: Pair) -> Pair:
         return pair
     count = math.ceil(pair.count * SEARCHED / max(float(pair.prior.sum()), 1.0))
     return pair if count >= pair.count else pair.take(np.arange(count) * pair.count // count)
+
+
+def _distances(fit: Fit, lens: Array | None, pair: Pair) -> tuple[Array, Array]:
+    """Squared residuals (n,) of a fit for lenses (2,) that are estimated, px^2, and the noise of these distances."""
+    if fit.lens is not None:
+        return lens_search.squared_px(fit.F, fit.lens.lens, pair), pair.noises
+    seen = across_lines(pair if lens is None else lens_search.undistorted(pair, lens), fit.F)
+    return residuals_squared_px(fit.F, seen), seen.noises if seen.stretch is None else seen.noises / seen.stretch
 
 
 def _at_noise(score: scores.SummedGains, own: FitScale, F: Array, pair: Pair) -> scores.Score:

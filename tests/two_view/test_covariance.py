@@ -144,17 +144,13 @@ def test_both_poses_of_a_plane_explain_it() -> None:
         assert float(distance[drawn["mask"][0]].median()) < 1
 
 
-def test_what_was_not_asked_for_is_not_there() -> None:
+def test_what_is_asked_for_is_there_and_nothing_else() -> None:
     s = reference.scene(0)
     e = fmtorch.find_fundamental(s.x0, s.x1, size0="unknown")
     assert e.covariance is None
     for name, argument in (("pair_type", "pair_type"), ("deviation_degrees", "covariance")):
         with pytest.raises(AttributeError, match=f"{argument}=True"):
             getattr(e, name)
-
-
-def test_covariance_needs_no_size_beside_calibrations() -> None:
-    s = reference.scene(0)
     assert not bool(fmtorch.find_essential(s.x0, s.x1, **CAMERAS, covariance=True).deviation_degrees.isnan().any())
 
 

@@ -102,8 +102,7 @@ def by_hand(lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array) -> tu
 
 
 def residuals(model: Array, lenses: tuple[Lens | None, Lens | None], x0: Array, x1: Array, plane: bool) -> Array:
-    """Tangent Sampson errors of F or H, px: the corrections of photographs' points that its constraint, by
-    differences, asks for."""
+    """Tangent Sampson errors of F or H, px: corrections of photographs' points to its constraint, by differences."""
 
     def constraint(x: Array) -> Array:
         ends = [x[:, :2], x[:, 2:]]

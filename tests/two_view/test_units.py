@@ -308,8 +308,7 @@ def test_one_unknown_lens(lens: float) -> None:
 
 
 def test_nine_exact_matches_have_the_lens_that_is_found() -> None:
-    """Fitzgibbon's solver, on samples of the same matches: exact ones tell lambda, those with noise far worse than the
-    fit to all."""
+    """Fitzgibbon's solver, on samples of the same matches: exact ones tell lambda, noisy ones far worse than all."""
     rng, nearest, own = np.random.default_rng(0), [], []
     for noise in (0.0, 0.3):
         x0, x1, _, _ = division.photographs(1, (-0.15, -0.15), noise=noise, wrong=0)
@@ -342,15 +341,25 @@ def test_a_pose_through_a_lens() -> None:
 
 def test_pairs_keep_to_themselves() -> None:
     pairs = [division.photographs(5, (-0.2, -0.2))[:2], division.photographs(6, (0, 0))[:2]]
-    pairs.append((pairs[0][0][:30], np.full((30, 2), 100.0)))
+    pairs += [(pairs[0][0][:30], np.full((30, 2), 100.0)), division.photographs(7, (-0.2, -0.2), noise=3.0)[:2]]
     together = found([x for x, _ in pairs], [x for _, x in pairs], lens="shared")
-    assert together.ok.tolist() == [True, True, False]
+    assert together.ok.tolist() == [True, True, False, True]
     for i, pair in enumerate(pairs):
         alone = found(*pair, lens="shared")
         assert torch.equal(together.F[i], alone.F[0])
         assert torch.equal(together.lens[i].nan_to_num(9), alone.lens[0].nan_to_num(9))
     assert together.lens[1].tolist() == [0, 0]
     assert torch.equal(together.F[1], found(*pairs[1]).F[0])
+
+
+def test_coarse_matches_have_lenses_at_their_own_noise() -> None:
+    x0, x1, F, _ = zip(*(division.photographs(seed, (-0.2, -0.2), noise=3.0) for seed in range(8)), strict=True)
+    both = [found(list(x0), list(x1), lens="shared", coarsest=times) for times in (8, 1)]
+    better, worse = (np.median([error_of_lens(e, each, i) for i, each in enumerate(F)]) for e in both)
+    assert better < 0.7 * worse
+    estimate, points = both[0], np.c_[x0[0], x1[0]]
+    distances = [abs(division.sampson(estimate.F[0].numpy(), x, (SIZE, SIZE), lenses(estimate))) for x in points]
+    assert estimate.inliers[0, : len(points)].tolist() == [distance <= 1.5 for distance in distances]
 
 
 def test_sizes_may_be_assumed() -> None:
