@@ -48,9 +48,7 @@ WARNINGS = {  # what each pair type leaves open
     "identical": "one photograph twice: matches determine neither F nor a pose",
     "unrelated": "the images show nothing in common",
 }
-CONTRADICTED = (
-    "far more matches agree without the calibration matrices: they are of other images or of another resolution"
-)
+CONTRADICTED = "far more matches agree without the calibration: it is of other images or of another resolution"
 
 BENT = (
     "a lens bends the images (lambda about {:.2f}), and F is of pinholes: give lens='shared', or undistort the points"
@@ -290,9 +288,8 @@ class Estimate(Record):
     def warning(self) -> tuple[str, ...]:
         """What the type of each pair leaves open, whether its matches contradict its calibration matrices or pinholes,
         and which sizes were doubtful.
-        Empty where there is nothing to say. Raises as `pair_type` where none of these was looked at."""
-        lens, looks = self.lens_suggested, (self.contradicted, self.sizes_doubtful, self.lens_suggested)
-        unknown = self.pair_type_index is None and any(look is not None for look in looks)
+        Empty where there is nothing to say."""
+        lens, unknown = self.lens_suggested, self.pair_type_index is None
         opens = [""] * len(self) if unknown else [WARNINGS[name] for name in self.pair_type]
         contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()
         said = [[CONTRADICTED if wrong else "", left] for wrong, left in zip(contradicted, opens, strict=True)]

@@ -329,7 +329,7 @@ class Ransac:
         if solution.fit is None or solution.inliers is None:
             return solution
         cameras = solution.fit.cameras
-        if not lens.any() and (cameras is None or not np.isfinite(known.deviations).all()):
+        if not lens.any() and (cameras is None or not all(0 < s < math.inf for s in known.deviations)):
             return solution._replace(lens=lens)
         if cameras is not None:
             fit = lens_search.lens_fit(lens, cameras, pair, solution.inliers)

@@ -189,8 +189,10 @@ def with_assumed_sizes(c: Correspondences, estimate: Callable[[Correspondences],
     significance = cast(torch.Tensor, together.significance)
     better = together.ok[second] & ~(significance[second] - significance[place[doubtful]] <= TWO_SIZES_GAIN)
     place = place.masked_scatter(doubtful, torch.where(better, second, place[doubtful]))
-    sizes = torch.cat([sizes[rows] for rows, sizes in tried])
-    return together[place].derived(sizes=sizes[place], sizes_doubtful=doubtful)
+    sizes, estimates = torch.cat([sizes[rows] for rows, sizes in tried]), together[place]
+    lens = estimates.lens_suggested  # one is not told from wrong sizes
+    lens = None if lens is None else lens.masked_fill(doubtful, torch.nan)
+    return estimates.derived(sizes=sizes[place], sizes_doubtful=doubtful, lens_suggested=lens)
 
 
 def _sized(c: Correspondences, rows: torch.Tensor, sizes: torch.Tensor) -> Correspondences:

@@ -143,8 +143,7 @@ def test_features_of_one_image_are_indexed_by_feature() -> None:
 
 def test_correspondences_defaults() -> None:
     c = Correspondences(torch.zeros(2, 3, 2), torch.zeros(2, 3, 2), torch.ones(2, 3, dtype=torch.bool))
-    assert (len(c), c.keys.tolist(), c.keys.dtype) == (2, [0, 0], torch.int64)
-    assert c.count().tolist() == [3, 3]
+    assert (len(c), c.keys.tolist(), c.keys.dtype, c.count().tolist()) == (2, [0, 0], torch.int64, [3, 3])
     assert all(getattr(c, f) is None for f in ("ratio", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
     assert same(c[0].to("cpu").compact(), c[:1])
 

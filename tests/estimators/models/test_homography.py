@@ -61,8 +61,7 @@ def test_noise_and_wrong_matches() -> None:
     for seed in range(10):
         m = matches(seed)
         estimate = fmtorch.find_homography(m.x0, m.x1, seed=seed)
-        assert (estimate.ok.tolist(), estimate.reason) == ([True], ("",))
-        assert estimate.model == "homography"
+        assert (estimate.ok.tolist(), estimate.reason, estimate.model) == ([True], ("",), "homography")
         assert bool(estimate.related.all())
         assert torch.linalg.norm(estimate.H[0]) == pytest.approx(1, abs=1e-14)
         assert (torch.from_numpy(np.c_[m.x0, np.ones(200)][m.right]) @ estimate.H[0, 2] > 0).all()
