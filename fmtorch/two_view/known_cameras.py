@@ -24,7 +24,7 @@ from fmtorch.two_view.arguments import camera_problems
 
 OFF_CENTRE = 0.1  # of a principal point, in units of the side, or beyond twice it a point: K may be of another image
 PROMISED = 1.25  # right matches that the prior expects, times the inliers, from which on K is doubted; mostly 1
-MORE, MORE_MATCHES = 1.1, 8  # inliers without K, times those with it and beyond, from which on it is contradicted
+MORE, BEYOND = 1.1, 8.0  # significance without K, times that with it and beyond, from which on it is contradicted
 
 
 class KnownCameras:
@@ -61,9 +61,8 @@ class KnownCameras:
 
     @torch.no_grad()
     def _compared(self, c: Correspondences, square: Correspondences, known: Estimate, seed: int) -> Estimate:
-        """The estimate with which calibrations its matches contradict: of those whose principal points may be of other
-        images, that suggest a lens, or of fewer inliers than the prior promises, the ones of far more inliers without K
-        than with K, and than with that lens."""
+        """The estimate with the calibrations that are contradicted: of those off centre, that suggest a lens or have
+        fewer inliers than the prior promises, the ones far less significant than none, with and without that lens."""
         rows, wrong, suggested = _off_centre(c), torch.zeros_like(known.ok), known.lens_suggested
         if suggested is not None:
             rows |= suggested.isfinite()
@@ -73,16 +72,17 @@ class KnownCameras:
         if not bool(rows.any()):
             return known.derived(contradicted=wrong)
         alone = c.detach()[rows].derived(K0=None, K1=None, focal=None, shared_focal=None)
-        without = self.estimator(alone if self.pruner is None else self.pruner(alone), seed).inliers.sum(1)
-        most = known.inliers[rows].sum(1)
-        if suggested is None:
-            wrong[rows] = without > MORE * most + MORE_MATCHES
-            return known.derived(contradicted=wrong)
-        bend = suggested[rows].double().nan_to_num(0)
-        lens = torch.stack([bend, torch.zeros_like(bend)], -1)[:, None].expand(-1, 2, 2)
-        bent = self.estimator(square.detach()[rows].derived(lens=lens), seed).inliers.sum(1)
-        wrong[rows] = without > MORE * torch.maximum(most, bent) + MORE_MATCHES
-        return known.derived(contradicted=wrong, lens_suggested=torch.where(wrong, torch.nan, suggested))
+        alone = alone if self.pruner is None else self.pruner(alone)
+        without = torch.as_tensor(judged(self.estimator(alone, seed), alone).significance)
+        most = torch.as_tensor(known.significance)[rows]
+        if suggested is not None:
+            bend = suggested[rows].double().nan_to_num(0)
+            lens = torch.stack([bend, torch.zeros_like(bend)], -1)[:, None].expand(-1, 2, 2)
+            bent = square.detach()[rows].derived(lens=lens)
+            most = torch.maximum(most, torch.as_tensor(judged(self.estimator(bent, seed), bent).significance))
+        wrong[rows] = without > MORE * most + BEYOND
+        suggested = None if suggested is None else torch.where(wrong, torch.nan, suggested)
+        return known.derived(contradicted=wrong, lens_suggested=suggested)
 
 
 class Images(NamedTuple):
