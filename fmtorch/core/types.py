@@ -218,7 +218,7 @@ class Estimate(Record):
     Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
     Where pinholes are assumed: lens_suggested (B,), lambda of one lens for both images with which the matches agree
     where they contradict pinholes, NaN where they do not.
-    Where calibration matrices are known: contradicted (B,), whether far more matches agree without them."""
+    Where anything is known of focal lengths: contradicted (B,), whether F is far more significant without it."""
 
     matrix: Float[Tensor, "b 3 3"]
     inliers: Bool[Tensor, "b n"]
