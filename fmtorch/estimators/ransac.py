@@ -269,9 +269,9 @@ class Ransac:
             solution = coarser._replace(samples=solution.samples + coarser.samples)
         if times == 1 or solution.fit is None:
             return solution
-        near = self.inlier_rule(_distances(solution.fit, solution.lens, pair)[0], pair)
+        within = self.inlier_rule(_distances(solution.fit, solution.lens, pair)[0], pair)
         seen = None if pair.stretch is None else across_lines(pair, solution.fit.F)
-        return solution._replace(inliers=near, pair=seen)
+        return solution._replace(inliers=within, pair=seen)
 
     def _of_one_scale(self, pair: Pair) -> Solution:
         """The same at the distances in pixels of the options."""
@@ -285,18 +285,18 @@ class Ransac:
     def _of_pinholes(self, pair: Pair) -> Solution:
         """Where cameras are calibrated and all but still, the search is repeated without the matches of outlying
         parallax, and what it finds is taken if it loses no more of these than may be inliers by accident."""
-        first = self._searched(pair, searched(pair))
+        first = self._search_and_fit(pair, searched(pair))
         outlying = focal_search.outlying(first.fit, first.inliers, pair)
         if outlying is None or first.inliers is None:
             return first
-        second = self._searched(pair, searched(pair.ignoring(outlying)))
+        second = self._search_and_fit(pair, searched(pair.ignoring(outlying)))
         if second.inliers is None:
             return first
         accidental = ACCIDENTAL + ACCIDENTAL_SHARE * (pair.count - np.count_nonzero(first.inliers))
         better = np.count_nonzero(outlying & first.inliers & ~second.inliers) <= accidental
         return (second if better else first)._replace(samples=first.samples + second.samples)
 
-    def _searched(self, pair: Pair, near: Pair) -> Solution:
+    def _search_and_fit(self, pair: Pair, near: Pair) -> Solution:
         """Search to fit, the search among some matches: of plausible cameras first where the image sizes are known, and
         without assumptions where these are doubtful."""
         plausible, draws, focal = None, 0, self.focal if pair.sizes_known else None

@@ -177,8 +177,8 @@ def with_assumed_sizes(c: Correspondences, estimate: Callable[[Correspondences],
     own, known = extents(c)
     square = own.amax(1).amax(1) < SQUARE * own.amax(1).amin(1)
     turned = (square & (own[..., 0] > own[..., 1]).sum(1).eq(1))[:, None]
-    one = torch.maximum(own[:, 0], torch.where(turned, own[:, 1].flip(-1), own[:, 1]))
-    same = torch.stack([one, torch.where(turned, one.flip(-1), one)], 1)
+    first = torch.maximum(own[:, 0], torch.where(turned, own[:, 1].flip(-1), own[:, 1]))
+    same = torch.stack([first, torch.where(turned, first.flip(-1), first)], 1)
     doubtful = known & (same > SAME_SIZE * own).flatten(1).any(1)
     kinds = [(known, same), (~known, own), (doubtful, own)]
     tried = [(rows, sizes) for rows, sizes in kinds if bool(rows.any())] or kinds[1:2]

@@ -56,8 +56,8 @@ class KnownCameras:
         estimate = judged(output_of(self.estimator, estimate, Estimate, square), square)
         with one_thread(c.mask.device):
             known = _with_cameras(estimate, square, images, self.covariance)
-        said = bool(images.measured.isfinite().any()) or c.shared_focal is not None
-        return self._compared(c, square, known, seed) if said else known
+        anything = bool(images.measured.isfinite().any()) or c.shared_focal is not None
+        return self._compared(c, square, known, seed) if anything else known
 
     @torch.no_grad()
     def _compared(self, c: Correspondences, square: Correspondences, known: Estimate, seed: int) -> Estimate:

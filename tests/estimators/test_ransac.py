@@ -252,8 +252,7 @@ def test_which_presets_are_weighted() -> None:
 
 @pytest.mark.parametrize("name", names("least_squares"))
 def test_a_constant_prior_is_as_good_as_none(name: str) -> None:
-    c = scenes()
-    estimator = quick(name)
+    c, estimator = scenes(), quick(name)
     without = estimator(c.replace(prior=None), seed=5)
     assert torch.equal(estimator(c.replace(prior=torch.full_like(c.prior, 0.5)), seed=5).F, without.F)
     assert not torch.equal(estimator(c, seed=5).F, without.F)
@@ -264,8 +263,7 @@ def test_a_constant_prior_is_as_good_as_none(name: str) -> None:
 @pytest.mark.parametrize("name", names("unweighted_least_squares"))
 def test_the_paper_s_presets_ignore_the_prior(name: str) -> None:
     c = scenes()
-    c = c.replace(prior=c.prior.double().requires_grad_())
-    estimator = quick(name)
+    c, estimator = c.replace(prior=c.prior.double().requires_grad_()), quick(name)
     F = estimator(c, seed=5).F
     assert torch.equal(F, estimator(c.replace(prior=None), seed=5).F)
     assert not F.requires_grad

@@ -81,8 +81,7 @@ def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
 
 def test_wrong_arguments() -> None:
     c = pair("general", 0)
-    estimate = estimated(c)
-    plane = fmtorch.find_homography(c.x0, c.x1)
+    estimate, plane = estimated(c), fmtorch.find_homography(c.x0, c.x1)
     for given, deviation, said in (
         (plane, 0, "estimate is of homography matrices"),
         (estimate[:0], 0, "estimate is of 0 pairs and c of 1"),
@@ -95,8 +94,7 @@ def test_wrong_arguments() -> None:
 def pitch(seed: int, up: bool, count: int = 60, wrong: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a court in metres, y up or down, where a camera beside it sees them, with 0.5 px of noise; the map."""
     rng = np.random.default_rng(seed)
-    court = rng.uniform([0, 0], [28, 15], (count, 2))
-    centre = np.array([14.0, -12, 7])
+    court, centre = rng.uniform([0, 0], [28, 15], (count, 2)), np.array([14.0, -12, 7])
     z = np.array([14.0, 7, 0]) - centre
     R = np.stack([np.array([1.0, 0, 0]), np.cross(z / np.linalg.norm(z), [1.0, 0, 0]), z / np.linalg.norm(z)])
     H = K @ np.c_[R[:, 0], R[:, 1], -R @ centre] @ np.diag([1, 1 if up else -1, 1])
@@ -160,8 +158,7 @@ def test_significance_is_that_of_its_definition() -> None:
     x0 = np.stack(np.meshgrid(np.arange(5) * 120.0, np.arange(4) * 120.0), -1).reshape(-1, 2)
     H = np.array([[1.1, 0.05, 12], [-0.04, 0.98, 7], [2e-5, -3e-5, 1]])
     x1 = mapped(H, x0) + rng.normal(size=(20, 2)) * np.r_[np.full(14, 0.7), np.full(6, 90.0)][:, None]
-    back = mapped(np.linalg.inv(H), x1)
-    areas = [np.prod(np.ptp(x, axis=0)) for x in (x0, x1)]
+    back, areas = mapped(np.linalg.inv(H), x1), [np.prod(np.ptp(x, axis=0)) for x in (x0, x1)]
     ends = zip((x0, x1), (back, mapped(H, x0)), areas, strict=True)
     chance = np.max([np.pi * ((a - b) ** 2).sum(1) / area for a, b, area in ends], 0)
     p = np.sort(np.clip(chance, 2.0**-26, 1))

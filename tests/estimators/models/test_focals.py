@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch import presets
 from fmtorch.core import Correspondences, collate
-from fmtorch.estimators import BestScore, Candidates, Focal, Pair, Ransac, Refinement, SaturatedGains, focal_search
+from fmtorch.estimators import BestScore, Candidates, Focal, Pair, Ransac, SaturatedGains, focal_search, refinement
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.models import focal_prior
 from fmtorch.estimators.models.focal_prior import QUANTILES, normal_quantiles
@@ -120,6 +120,14 @@ def test_a_plane_does_not_deceive_where_cameras_are_plausible() -> None:
             values.append(error(presets.build("estimator", "fmtorch", focal={"samples": samples})(pair.c, 0).F, pair))
     assert np.median(errors[250]) < 0.02
     assert np.median(errors[250]) < 0.5 * np.median(errors[0])
+
+
+@pytest.mark.parametrize(("seed", "focal"), [(2, (0.7, 1.6)), (7, (0.8, 1.6))])
+def test_doubtful_cameras_are_searched_without_assumptions(seed: int, focal: Any, monkeypatch: Any) -> None:
+    pair, estimator = photographs(seed, (WIDE, WIDE), focal, 100, 0.5, 0.5), presets.build("estimator", "fmtorch")
+    assert error(estimator(pair.c, 0).F, pair) < 0.005
+    monkeypatch.setattr(refinement, "DOUBTFUL_GAIN", math.inf)
+    assert error(estimator(pair.c, 0).F, pair) > 0.01
 
 
 def test_unknown_sizes_are_searched_without_assumptions() -> None:
@@ -256,8 +264,8 @@ def test_rounds_end_when_enough_of_them_confirm_the_best(min_rounds, confirmatio
 
 
 def searching(iterations: int = 12, **options: int) -> FocalSearch:
-    focal = Focal(iterations=iterations, samples=0, **options)
-    return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), Refinement(None), None, None)
+    focal, refine = Focal(iterations=iterations, samples=0, **options), refinement.Refinement(None)
+    return FocalSearch(focal, FundamentalWithFocals(), BestScore(SaturatedGains(0.3)), refine, None, None)
 
 
 def free(F: np.ndarray, pair: Pair) -> Candidates:
@@ -316,8 +324,7 @@ def test_a_crop_keeps_the_model_without_prior() -> None:
     c, truth, _ = photographs(3, outliers=0.0, noise=0.1)
     T = np.array([[1, 0, -4000], [0, 1, 0], [0, 0, 1.0]])  # the principal point is far outside
     pair = pair_of(c.replace(x0=c.x0 + torch.tensor([4000.0, 0])))
-    F = to_units(truth @ T, pair)
-    rival = to_units(truth @ T + 0.01 * truth.T, pair)
+    F, rival = to_units(truth @ T, pair), to_units(truth @ T + 0.01 * truth.T, pair)
     selection = searching().select(free(np.stack([F, rival]), pair), pair, None)
     assert np.array_equal(selection.F, F)
     assert selection.cameras is None

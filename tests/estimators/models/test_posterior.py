@@ -134,8 +134,7 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     begin, _ = FAMILY.refine(to_units(truth, pair)[None], pair, 12)
     begin.focal[0] += [-0.15, 0.15]
     weighted = Weighted.of(matches.points, pair.weight, matches.s2)
-    before = evaluated(begin, pair, "truncated", px, precision)
-    out = posterior.start_at(begin.copy())
+    before, out = evaluated(begin, pair, "truncated", px, precision), posterior.start_at(begin.copy())
     posterior.minimise(out, weighted, posterior.images_of(pair), posterior.Limits(precision, 1, 0.05))
     assert out.cost == before.cost
     _, cameras, _ = FAMILY.fit(begin, pair, px, posterior.Limits(precision, 30, 0.05))
@@ -161,8 +160,7 @@ def factors(seed: int) -> tuple[np.random.Generator, np.ndarray, np.ndarray, np.
     t, R = rng.normal(size=3), Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
     E = np.cross(np.eye(3), -t / np.linalg.norm(t)) @ R
     U, _, Vt = np.linalg.svd(E)
-    turn = np.eye(3)
-    angle = rng.uniform(0, 2 * np.pi)
+    turn, angle = np.eye(3), rng.uniform(0, 2 * np.pi)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     U, V = U @ turn, Vt.T @ turn  # of a double singular value
     return rng, E, U * [1, 1, rng.choice([-1, 1])], V * [1, 1, rng.choice([-1, 1])]
