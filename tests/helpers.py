@@ -92,11 +92,6 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def cross_matrix(t: np.ndarray) -> np.ndarray:
-    x, y, z = t
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
 def edit_lines(path: Path, change: Callable[[list[str]], list[str]]) -> None:
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
 

@@ -84,7 +84,7 @@ def match_folder(
             kept = f"{work.done + work.taken} of {len(pairs)} pairs are kept in {output}"
             raise KeyboardInterrupt(f"{kept}; the same command continues") from None
     shutil.rmtree(scratch, ignore_errors=True)
-    _expect_some(work, len(pairs))
+    _expect_pairs(work, len(pairs))
     graph = export.view_graph(journal, images, pairs)
     shared = fields.camera == "shared" or cameras.word == "shared"
     written = ["export.json", *export.write_exports(journal, pairs, kinds, output, shared)]
@@ -97,7 +97,7 @@ def match_folder(
     return output
 
 
-def _expect_some(work: FolderMatches, pairs: int) -> None:
+def _expect_pairs(work: FolderMatches, pairs: int) -> None:
     for trouble in work.troubles:
         errors.print(trouble, style="bold", soft_wrap=True)
     for trace in work.tracebacks:

@@ -14,10 +14,10 @@ from fmtorch.core.options import CACHE, CACHE_LIMIT, DEBUG, Cache, Count, Debug,
 from fmtorch.training.options import TrainOptions
 
 DEVICE = "auto | cpu | cuda | cuda:1 | mps"
-BentBy = Literal["shared", "unknown"] | float | None
+BentBy = Literal["shared", "unknown"] | float | list[Any] | None
 LENS = (
     "how much lenses bend straight lines: shared (one unknown lens), unknown (one of each image), or lambda of the "
-    "division model in half diagonals; null: not at all"
+    "division model in half diagonals, or [lambda,deviation]; null: not at all"
 )
 OF_DATA = "known: those of the data set. Images are undistorted with null alone. Part of the run's identity"
 REPLACED = "Groups are replaced by name (estimator=lmeds), values by path (estimator.threshold=0.5)."

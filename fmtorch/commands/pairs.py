@@ -24,7 +24,7 @@ from fmtorch.jobs import Execution, Factory, Local, Source, WorkerPool, in_order
 from fmtorch.presets.composition import execution_of, plain, read_fields
 from fmtorch.runs.fingerprint import digest
 from fmtorch.scenes import RenderedPairs
-from fmtorch.training.matched_pairs import MatchedPairs, front, write_oanet
+from fmtorch.training.matched_pairs import MatchedPairs, stages_before_estimation, write_oanet
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = (Construction.__module__,)  # by the process that workers are forked of
@@ -135,8 +135,8 @@ def _write_matches(
     """Match the pairs of these candidates, which is taken up where it was interrupted, and write OANet's files."""
     chosen = PairsOf(construction, ranks)
     matches = MatchedPairs(
-        chosen, front(config), root=construction.work / "matched", labels="geodesic",
-        execution=execution.decided(False), build=functools.partial(front, config),
+        chosen, stages_before_estimation(config), root=construction.work / "matched", labels="geodesic",
+        execution=execution.decided(False), build=functools.partial(stages_before_estimation, config),
         progress=reporter(progress, "matching"),
     )  # fmt: skip
     write_oanet(matches, chosen, construction.folder)

@@ -20,7 +20,7 @@ WITH_KERNELS = ("estimators", "geometry", "matching", "metrics", "pruning", "sce
 
 
 def warm_up() -> int:
-    """Compile the kernels of all modules that this machine has not compiled yet; how many there are.
+    """Compile the kernels of all stages that this machine has not compiled yet; how many there are.
     Raises ValueError where kernels are switched off or cannot be kept."""
     if kernel.off():
         raise ValueError(f"kernels are switched off ({kernel.SWITCH}=off)")

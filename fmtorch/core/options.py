@@ -182,7 +182,7 @@ def expected(annotation: Any) -> str:
     if args and issubclass(kind, tuple) and args[-1] is not Ellipsis:
         return f"a list of {', '.join(map(expected, args))}"
     if _holds_a_list(kind):
-        return "a list" + (f", each {expected(args[0])}" if args else "")
+        return "a list" + (f", each {expected(args[0])}" if args and args[0] is not Any else "")
     if dataclasses.is_dataclass(kind):
         return f"a mapping of: {', '.join(field.name for field in dataclasses.fields(kind))}"
     return f"a {kind.__name__}: a mapping with a `_target_`"

@@ -183,7 +183,7 @@ class Construction:
     """The construction of pairs in a folder.
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
-    overlap: the least and the greatest overlap of pairs (`fmtorch.data.construction`); None: the paper's rule.
+    overlap: the least and the greatest overlap of pairs; None: the paper's rule.
     matches: what the matches are computed by that take the place of images; None: images. Raises ValueError, when its
     `rule` is first asked for, where the data set's overlaps are not known."""
 

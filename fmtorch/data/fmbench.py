@@ -1,4 +1,4 @@
-"""Photographs with a ``Camera.txt`` beside them: the cameras of the FM-Bench layout, before there are pairs."""
+"""The layout of FM-Bench: pairs with their F, and photographs with a ``Camera.txt``, of which pairs are made."""
 
 import dataclasses
 import hashlib

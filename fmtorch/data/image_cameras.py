@@ -375,12 +375,11 @@ def _of_json(path: Path) -> dict[str, ImageCamera]:
         raise DataError(f"{path}: {error}; it must be a JSON file of {FORM}") from error
     if not isinstance(content, dict) or not content:
         raise DataError(f"{path}: it must be {FORM}")
-    return {
-        name: ImageCamera(None if value is None else _lens(value, f"{path}, {name}")) for name, value in content.items()
-    }
+    return {name: ImageCamera(None if K is None else pinhole(K, f"{path}, {name}")) for name, K in content.items()}
 
 
-def _lens(value: object, place: str) -> Lens:
+def pinhole(value: object, place: str) -> Lens:
+    """The camera of [fx, fy, cx, cy]. Raises DataError, naming the place, for anything else."""
     numbers = value if isinstance(value, list) else []
     plain = len(numbers) == 4 and all(isinstance(number, int | float) for number in numbers)
     if not plain or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:

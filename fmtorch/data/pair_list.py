@@ -198,8 +198,8 @@ class PairList(HeldPairs):
 
     Args:
         root: the folder of the images, to which the names of the list are relative.
-        file: a text list of SuperGlue's or glue-factory's columns (`fmtorch.data.pair_list`); an ``.npz`` of LoFTR's
-            (`fmtorch.data.pair_list`); or a text file with the name of such an ``.npz`` in each line.
+        file: a text list of SuperGlue's or glue-factory's columns; an ``.npz`` of LoFTR's; or a text file
+            with the name of such an ``.npz`` in each line.
         resize: what images are resized to when read, px: one number for the longer side, [width, height] for both;
             None: not at all, but for lists of ScanNet whose K are of 640 x 480. K follows.
         origin: the first pixel's centre in K; None: 0.5 for glue-factory's lists and MegaDepth's ``.npz``, otherwise 0.

@@ -21,7 +21,8 @@ from fmtorch.estimators.models.with_focals import gain_without_prior
 from fmtorch.estimators.pair import Lens, Pair, squared
 from fmtorch.estimators.refinement import DOUBTFUL_GAIN, FOCAL_TOLERANCE, PRIOR_CONFLICT_GAIN, Fit, LensFit
 from fmtorch.geometry.arithmetic import logarithm_kernel
-from fmtorch.geometry.levenberg_marquardt import MATCH, TINY, Rows, Weighted, in_rows, minimiser, rows_of, summation
+from fmtorch.geometry.epipolar import TINY
+from fmtorch.geometry.levenberg_marquardt import MATCH, Rows, Weighted, in_rows, minimiser, rows_of, summation
 from fmtorch.geometry.matrices import assign
 from fmtorch.geometry.rank2_manifold import damped_step
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector

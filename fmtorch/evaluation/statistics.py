@@ -67,9 +67,9 @@ def recalled(nsgd: Values, threshold: float = THRESHOLD) -> Values:
     return _per_pair(metrics.recall(torch.from_numpy(nsgd)[..., None], threshold))
 
 
-def areas(nsgd: Values) -> Values:
+def areas(errors: Values, threshold: float = THRESHOLD) -> Values:
     """What each pair adds to AUC@0.05, (n,): the share of thresholds from 0 to 0.05 above its NSGD; see `recalled`."""
-    return _per_pair(metrics.mean_recall(torch.from_numpy(nsgd)[..., None], THRESHOLD))
+    return _per_pair(metrics.mean_recall(torch.from_numpy(errors)[..., None], threshold))
 
 
 _FINE = partial(recalled, threshold=FINE_THRESHOLD)
@@ -150,7 +150,7 @@ def homography_figures(errors: Values) -> dict[str, float | int | None] | None:
 def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """Mean of the values that are not NaN, times `scale`, with its 95 % interval; None where all are NaN.
     values, scenes: one per pair, (n,). share: the values are successes, see `share_interval`."""
-    known, places = _known(scenes, values)
+    known, places = _without_nan(scenes, values)
     if not len(places):
         return None
     return (share_interval if share else bootstrap_mean)(values[known], places).scaled(scale)
@@ -163,7 +163,7 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
     a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`."""
     if len(a) != len(b):
         raise ValueError(f"a difference is of the same pairs, but a has {len(a)} and b has {len(b)}")
-    known, places = _known(scenes, a, b)
+    known, places = _without_nan(scenes, a, b)
     if not len(places):
         return None
     if share:
@@ -172,7 +172,7 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
     return bootstrap_mean((a - b)[known], places).scaled(scale) if units >= MIN_UNITS else None
 
 
-def _known(scenes: Sequence[str], *values: Values) -> tuple[NDArray[np.bool_], list[str]]:
+def _without_nan(scenes: Sequence[str], *values: Values) -> tuple[NDArray[np.bool_], list[str]]:
     known: NDArray[np.bool_] = ~np.any([np.isnan(each) for each in values], axis=0)
     return known, [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
 

@@ -357,7 +357,7 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
         two = {first: runs[first], other: runs[other]}
         a, b = common(two, axis.column)
         counts.append(len(a))
-        compared.append(_ahead(a, b, [scene[key] for key in shared_keys(two)], axis is curves.NSGD))
+        compared.append(_paired_differences(a, b, [scene[key] for key in shared_keys(two)], axis is curves.NSGD))
     ends = [abs(end) for cells in compared for _, i in cells if i for end in (i.low, i.high)]
     widest = max(ends, default=1.0) or 1.0
     rows = {
@@ -375,24 +375,22 @@ def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
     return Table(f"{first} minus each other run, pair by pair", head, rows, note)
 
 
-def _ahead(a: Values, b: Values, scenes: Sequence[str], of_nsgd: bool) -> list[tuple[str, Interval | None]]:
+def _paired_differences(
+    a: Values, b: Values, scenes: Sequence[str], of_nsgd: bool
+) -> list[tuple[str, Interval | None]]:
     """Differences of recall at both thresholds and of AUC@0.05, or of areas below corner errors, of the same pairs."""
     if of_nsgd:
         limits = THRESHOLD, statistics.FINE_THRESHOLD
         values = [(statistics.recalled(a, t), statistics.recalled(b, t), True) for t in limits]
         values.append((statistics.areas(a), statistics.areas(b), False))
     else:
-        values = [(_area(a, t), _area(b, t), False) for t in statistics.CORNER_THRESHOLDS]
+        values = [(statistics.areas(a, t), statistics.areas(b, t), False) for t in statistics.CORNER_THRESHOLDS]
     cells: list[tuple[str, Interval | None]] = []
     for own, other, share in values:
         interval = statistics.difference(own, other, scenes, statistics.PERCENT, share=share) if len(a) else None
         few = f"{statistics.PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
         cells.append((few if interval is None else f"{interval:+.1f}", interval))
     return cells
-
-
-def _area(errors: Values, threshold: float) -> Values:
-    return np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
 
 
 def _around_zero(i: Interval | None, widest: float) -> Bar | None:

@@ -180,8 +180,8 @@ def local_feature(
     `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
     ONNX file than the shipped one. precision: of the networks, fp32 or int8. threads: of each network. Raises
     ValueError for an unknown name or option, naming those there are. Networks are read when first used."""
-    if precision not in ("fp32", "int8"):
-        raise ValueError(f"precision={precision}: it must be fp32 or int8")
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision={precision}: it must be {' or '.join(PRECISIONS)}")
 
     def by(part: Callable[[PatchFunction], Part], name: str) -> Callable[..., Part]:
         return lambda network=name: part(PatchNetwork(network_file(network, precision), threads=threads))

@@ -301,4 +301,4 @@ def _homography_within(h: Array, x: Any, y: Any, u: Any, v: Any, limit: Any) -> 
 
 
 HOMOGRAPHY = Residual("homography", _homography_of_lanes, _homography_of_match, _homography_within)
-"""The Sampson distance of a homography (4.2.6); infinite behind its horizon (`homography_objective_kernels`)."""
+"""The Sampson distance of a homography (4.2.6); infinite behind its horizon (`homography_refine`)."""

@@ -24,7 +24,7 @@ from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
 
 class HomographyError(NamedTuple):
-    """Of models and matches that broadcast to *s; see `homography_objective_kernels`.
+    """Of models and matches that broadcast to *s, by the terms of Hartley & Zisserman 2004, 4.2.6.
     squared: squared distances, infinite where undefined. front: whether the model's third coordinate at the match is
     positive. equations: e. inverse: the three entries of ``(J J^T)^-1``. corrected: x and y, their corrections added,
     and W times the multipliers l. multipliers: l."""

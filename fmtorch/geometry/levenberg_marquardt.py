@@ -1,4 +1,4 @@
-"""Robust losses, and Levenberg-Marquardt: the one loop of all non-linear fits, over the models of one pair.
+"""Robust losses, and Levenberg-Marquardt: the loop of non-linear fits, over the models of one pair.
 
 Losses grow more slowly than the squared residual. Each is scaled so that ``loss ~ r^2`` for small residuals;
 ``weight = d loss / d r^2`` is then 1 at zero, and minimising ``sum weight * r^2`` with the weights held fixed, again
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import logarithm_1p_kernel
 from fmtorch.geometry.arithmetic import sqrt as exact_sqrt
+from fmtorch.geometry.epipolar import TINY
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, Inner, inner, kernel, matrix
 from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
@@ -138,7 +139,6 @@ def named_loss(name: str) -> RobustLoss:
 
 # Robust errors of one pair, compiled, and the loop that minimises them
 
-TINY = 1e-30  # as in `residuals`
 LOSS_CODES = {name: code for code, name in enumerate(LOSSES)}
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = LOSS_CODES.values()
 NO_TABLE = np.empty((2, 0))

@@ -1,7 +1,8 @@
 """Small matrices in fixed-order arithmetic: the nearest of rank two, the eigenvector of the smallest eigenvalue.
 
 `torch.linalg.eigh` rounds differently with the memory alignment of each matrix, so the same matrix gives different
-last bits in different batch positions. These functions do not. Each has a tensor form and one for kernels."""
+last bits in different batch positions. These functions do not. Those that solvers with gradients and kernels need have
+two forms."""
 
 import math
 from typing import Any, cast

@@ -199,13 +199,12 @@ def _oanet_pair(file: Any, path: Path, key: str, _: Images) -> Stored:
     return known.K, known.R, known.t, functools.partial(oanet.matches, path, key, known)
 
 
-CORNER = 0.5  # where glue-factory puts the centre of the first pixel
 WITH_GEOMETRY: Mapping[str, Callable[[Path, Path | None], Iterator[ImagePair]]] = {
     "ransac_tutorial": tutorial_pairs,
     "posebench": functools.partial(_pairs, keys_of=h5.keys, read=_posebench_pair),
     "oanet": functools.partial(_pairs, keys_of=oanet.keys, read=_oanet_pair),
 }
-WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}  # of the first pixel's centre
+WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": 0.5, "vismatch": 0.0}  # of the first pixel's centre
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from fmtorch.core.lenses import division_lens
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImageCameras, ImageSource, Lens, exif_focal, read_image
+from fmtorch.data.image_cameras import pinhole
 from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
@@ -116,13 +117,9 @@ class PhotographCameras:
 def _pinhole(K: str | Sequence[float | int]) -> Lens:
     words = K.replace(",", " ").replace("[", " ").replace("]", " ").split() if isinstance(K, str) else K
     try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 4 or not all(map(math.isfinite, numbers)) or min(numbers[:2]) <= 0:
-        raise ValueError(f"K={K}; it must be fx,fy,cx,cy in pixels, with positive focal lengths")
-    fx, fy, cx, cy = numbers
-    return Lens(fx, fy, cx, cy)
+        return pinhole([float(word) for word in words], "K")
+    except ValueError as error:
+        raise ValueError(f"K={K}; it must be fx,fy,cx,cy in pixels, with positive focal lengths") from error
 
 
 Image = NDArray[np.uint8]

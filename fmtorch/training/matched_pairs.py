@@ -117,7 +117,7 @@ def _identity(dataset: PairDataset, stages: Pipeline, rule: labelled.Rule) -> di
     }  # fmt: skip
 
 
-def front(config: DictConfig) -> Pipeline:
+def stages_before_estimation(config: DictConfig) -> Pipeline:
     """The stages before estimation that a config names: features, matcher, and the pruners `before`, if any."""
     features = presets.instantiate(presets.plain(config.features), "features")
     extractor = cached(features, config.get("cache"), config.get("cache_limit"))

@@ -47,7 +47,7 @@ from fmtorch.runs import identity_digest
 from fmtorch.scenes import RenderedPairs
 from fmtorch.training.export import Evaluation, Use, Validation, expect_figure, quiet, write_result
 from fmtorch.training.labelled import Augmentation, LabelledMatches, keep_ratio
-from fmtorch.training.matched_pairs import MatchedPairs, NamedPairs, OANetPairs, front
+from fmtorch.training.matched_pairs import MatchedPairs, NamedPairs, OANetPairs, stages_before_estimation
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import Optimisation, TrainOptions
 from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
@@ -400,8 +400,9 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
             return source.matches.select(indices)
         labels = "pixels" if isinstance(source, PlanePairs) else options.labels
         return MatchedPairs(
-            PairSubset(source, indices) if len(indices) < len(source) else source, front(config),
-            execution=execution_of(config, config.workers).decided(False), build=functools.partial(front, config),
+            PairSubset(source, indices) if len(indices) < len(source) else source, stages_before_estimation(config),
+            execution=execution_of(config, config.workers).decided(False),
+            build=functools.partial(stages_before_estimation, config),
             progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip
 

@@ -22,14 +22,14 @@ from fmtorch.geometry.epipolar import mean_stretch
 
 
 @runtime_checkable
-class Shared(Protocol):
+class DLPackArray(Protocol):
     """An array of another library, which DLPack shares."""
 
     def __dlpack__(self, **options: Any) -> Any: ...
 
 
 Array = Tensor | NDArray[Any]
-Arrays = Array | Sequence[Any] | Shared  # one array, or a list of them: of pairs of different lengths
+Arrays = Array | Sequence[Any] | DLPackArray  # one array, or a list of them: of pairs of different lengths
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 Lens = Literal["shared", "unknown"] | float | Arrays | CalibratedLens | None
 
@@ -304,7 +304,7 @@ def _of_both(value: Any, name: str, unknown: tuple[float, float], forms: str) ->
         values = [unknown if entry is None else entry for entry in value] if isinstance(value, list | tuple) else value
         values = _floating(values, name)
     except TypeError as error:
-        raise TypeError(f"{name} is {value}; {forms}") from error
+        raise ValueError(f"{name} is {value}; {forms}") from error
     values = values.expand(2, 2) if values.shape == (2,) else values
     if values.dim() not in (2, 3) or values.shape[-2:] != (2, 2):
         raise ValueError(f"{name} has shape {tuple(values.shape)}; {forms}")

@@ -116,7 +116,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("train pruner=lc trainer.devices={}", "trainer.devices={}; it must be"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch, capfd):
+def test_a_mistake_is_reported_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch, capfd):
     if words.startswith("train"):
         pytest.importorskip("lightning", reason="training needs the extra `train`")
     line = ended(monkeypatch, tmp_path, *words.split())

@@ -154,11 +154,13 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
         ("pruner=lc pruner.lc.file=runs/absent", "absent.safetensors does not exist: fmtorch train pruner=lc"),
         ("dataset.root=nowhere", "nowhere: no such folder"),
         ("lens=-0.6", "it is lambda in half diagonals, from -0.45 to 0.2"),
+        ("lens=[null,0]", "lens is [None, 0]; it must be None"),
+        ("lens=[[0,0.1],[-0.6,0]]", "lens of image 1 of pair 0 is [-0.6, 0.0]"),
         ("device=cuda", "sees no CUDA device"),
         ("estimator.score=psac", "score is 'psac'"),
     ],
 )
-def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, monkeypatch):
+def test_what_cannot_be_run_is_reported(words, message, data, command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     own(tmp_path, "pruner", "threshold: 0.5\n", "empty")
     (tmp_path / "my_conf" / "pruner" / "binary.yaml").write_bytes(b"\xb5\xff\x00 binary")
@@ -170,7 +172,7 @@ def test_what_cannot_be_run_is_told(words, message, data, command, tmp_path, mon
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_in_which_nothing_succeeds_is_told(data: list[str], command: RunCommand, tmp_path: Path) -> None:
+def test_a_run_in_which_nothing_succeeds_is_reported(data: list[str], command: RunCommand, tmp_path: Path) -> None:
     for image in (tmp_path / "Set" / "scene" / "Images").iterdir():
         image.write_bytes(b"no picture")
     assert "every pair failed" in command("eval", *data, "output=run", cwd=tmp_path)

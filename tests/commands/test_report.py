@@ -77,7 +77,7 @@ def test_pairs_shown_are_those_where_runs_differ() -> None:
     assert differing_pairs({"a": first, "b": to_table(results([0.1], "else")).slice(0, 0)}, 3) == []
 
 
-def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
+def test_folders_of_runs_are_listed_and_missed(tmp_path: Path) -> None:
     for name in ("a", "deep/b"):
         RunFolder.open(tmp_path / name, {"pipeline": name})
     assert report.run_folders([tmp_path]) == [tmp_path / "a", tmp_path / "deep" / "b"]

@@ -238,7 +238,7 @@ def claimed(folder: Path, settings: dict[str, object], alone: bool = True) -> No
     claim(folder / "settings.json", settings, "sketches", "choose another output", alone)
 
 
-def test_a_folder_is_made_and_found_again(tmp_path: Path) -> None:
+def test_a_folder_is_created_and_opened_again(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     write_file(folder / "settings.json.0123.tmp", "{")  # what a killed writer left is nothing
     for _ in range(2):

@@ -124,7 +124,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(scenes, tmp_pat
         ("dataset=kitti dataset.root=kitti dataset.sequences=['06'] overlap=[0.1,0.4]", "dataset=kitti has neither"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch):
+def test_a_mistake_is_reported_in_one_line_and_nothing_written(words, message, tmp_path, monkeypatch):
     write_kitti(tmp_path / "kitti")
     with pytest.raises(SystemExit, match=r"^error: ") as end:
         run(tmp_path, monkeypatch, *words.split())

@@ -11,7 +11,8 @@ from fmtorch.data import DataError, DepthDataset, FMBenchPairs, PairDataset, loa
 from fmtorch.data.pairs import PairSubset
 from tests.conftest import shared_path
 from tests.data import native
-from tests.helpers import apart, cross_matrix
+from tests.helpers import apart
+from tests.reference.solvers import skew
 
 LINE = "0 1 0 0 0 0 0 -2 0 2 0"
 NO_IMAGE = ("0 7 0 0 0 0 0 -2 0 2 0", r"no image .*a/Images/00000007\.jpg \(or \.png\)")
@@ -120,7 +121,7 @@ def test_real_sets() -> None:
 
     # F = K1^-T [t]x R K0^-1, up to scale and sign; the cameras are given with 17 digits.
     for pair in list(dataset)[::25]:
-        F = np.linalg.inv(pair.K1).T @ cross_matrix(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
+        F = np.linalg.inv(pair.K1).T @ skew(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
         assert apart(F / np.linalg.norm(F), pair.F) < 1e-12
 
 

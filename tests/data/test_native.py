@@ -69,7 +69,7 @@ def test_a_missing_image_or_a_car_that_stands_still_is_a_problem_of_its_pairs_al
     assert (pairs["0-1"].F.any(), pairs["1-2"].problem) == (False, None)
 
 
-def test_missing_sequences_and_roots_are_told(tmp_path: Path) -> None:
+def test_missing_sequences_and_roots_are_reported(tmp_path: Path) -> None:
     root = write_kitti(tmp_path / "KITTI")
     for options, said in (
         ({}, "kitti needs root: the folder with sequences/ and poses/"),
@@ -129,7 +129,7 @@ def test_poses_are_interpolated_to_the_time_of_the_frame(tmp_path: Path) -> None
     assert abs(x1 @ pair.F @ x0) / np.linalg.norm(x0) / np.linalg.norm(x1) < 1e-12
 
 
-def test_the_camera_is_told_by_the_name(tmp_path: Path) -> None:
+def test_the_name_says_which_camera(tmp_path: Path) -> None:
     for name in ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y", "mine"):
         write_tum(tmp_path, name, frames=2)
     names = ("rgbd_dataset_freiburg2_x", "rgbd_dataset_freiburg3_y")

@@ -14,8 +14,8 @@ import pytest
 
 from fmtorch.data import DataError, NpzArrays, load, read_image
 from tests.data import lists
-from tests.helpers import apart, cross_matrix
-from tests.reference.solvers import unit
+from tests.helpers import apart
+from tests.reference.solvers import skew, unit
 
 PAIRS = ((0, 1), (2, 3), (1, 5))
 
@@ -41,7 +41,7 @@ def test_cameras_are_those_of_the_list(form: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(pair.K1, K1, atol=1e-9)
         np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)  # the cameras' own rotations are rounded
         np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-9)
-        assert apart(pair.F, unit(np.linalg.inv(K1).T @ cross_matrix(T[:3, 3]) @ T[:3, :3] @ np.linalg.inv(K0))) < 1e-6
+        assert apart(pair.F, unit(np.linalg.inv(K1).T @ skew(T[:3, 3]) @ T[:3, :3] @ np.linalg.inv(K0))) < 1e-6
         assert (pair.family, pair.scene) == ("list", "list")
         assert read_image(pair.image0).shape[:2] == cv2.imread(str(lists.images() / lists.name(i))).shape[:2]
 

@@ -191,7 +191,7 @@ def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: 
         ({"solver": "four_point", "focal": {}}, "is for fundamental matrices"),
     ],
 )
-def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
+def test_bad_options_are_reported(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Ransac(**options)  # type: ignore[arg-type]
 

@@ -103,7 +103,7 @@ def test_matches_that_are_no_numbers_are_none(value: float) -> None:
     assert few == "19 matches; at least 20 are needed"
 
 
-def test_pairs_that_cannot_be_estimated_are_told_why() -> None:
+def test_pairs_that_cannot_be_estimated_have_a_reason() -> None:
     reasons = {name: normalized(c) for name, c in {**degenerate(), **small()}.items()}
     failures = {name: reason for name, reason in reasons.items() if isinstance(reason, str)}
     assert failures == {

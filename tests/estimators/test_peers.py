@@ -141,7 +141,7 @@ def test_unknown_parts_are_refused_with_the_choices(name: str, part: str, choice
 
 
 @pytest.mark.parametrize("flags", [0, 1])
-def test_inliers_of_gc_ransac_are_told_from_its_matrix(flags: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inliers_of_gc_ransac_follow_from_its_matrix(flags: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its binding returns flags that are all set, or none, whatever the matrix."""
     c = scene(0, 40)
     truth = presets.build("estimator", "lmeds")(c).F[0].numpy()

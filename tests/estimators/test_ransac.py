@@ -230,7 +230,7 @@ def test_the_prior_and_the_quality_decide_where_there_are_more_outliers_than_inl
     [({"loss": "tukey"}, "loss is 'tukey'"), ({"threshold": 0.0}, "must be positive"),
      ({"starts": []}, "list of integers"), ({"starts": [1, -1]}, "list of integers")],
 )  # fmt: skip
-def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
+def test_bad_options_are_reported(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         IterativelyReweighted(**{"loss": "huber", "threshold": 1.0, **options})  # type: ignore[arg-type]
 

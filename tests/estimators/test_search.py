@@ -173,7 +173,7 @@ def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None,
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("shift", [0.0, 3000.0])
 @pytest.mark.parametrize("scale", SCALES)
-def test_points_of_a_line_are_told_from_points_near_one(scale: float, shift: float, dtype: type) -> None:
+def test_points_of_a_line_are_distinguished_from_points_near_one(scale: float, shift: float, dtype: type) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         direction, start = rng.normal(size=2), rng.uniform(0, 500, 2) + shift

@@ -190,7 +190,7 @@ def test_a_worker_ends_with_the_process_that_was_killed() -> None:
     assert not alive(worker)
 
 
-def test_a_process_that_ends_is_told() -> None:
+def test_a_process_that_ends_is_reported() -> None:
     """After the pairs of its batch were tried alone."""
     images = [ImageSource(f"{i}", Path(f"{i}.png")) for i in range(3)]
     pairs, rows = [pair(f"0-{i}", images[0], images[i]) for i in (1, 2)], list[PairRow]()

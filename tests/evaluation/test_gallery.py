@@ -94,7 +94,7 @@ def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(tm
     del sys.modules["own_estimator_of_a_test"]
 
 
-def test_each_data_set_is_found_in_its_own_root(tmp_path: Path) -> None:
+def test_each_data_set_is_looked_for_in_its_own_root(tmp_path: Path) -> None:
     roots = [distribution(tmp_path / "a", "A", 2), distribution(tmp_path / "b", "B", 3)]
     for root in roots:
         dataset = data.load("fmbench", root=root)

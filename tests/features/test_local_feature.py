@@ -233,7 +233,7 @@ def test_the_shipped_codebooks_are_those_of_the_card(name: str, kind: str) -> No
     torch.testing.assert_close(shipped.basis.T @ shipped.basis, torch.eye(64), atol=1e-5, rtol=0)
 
 
-def test_files_that_are_no_codebook_are_told(tmp_path: Path) -> None:
+def test_files_that_are_no_codebook_are_reported(tmp_path: Path) -> None:
     said = r"no such file; make it with `python scripts/make_models\.py codebooks`"
     with pytest.raises(FileNotFoundError, match=said):
         describe.load_codebook(tmp_path / "none.npz")

@@ -63,7 +63,7 @@ def test_kinds_of_synthetic_pairs(kind: str) -> None:
             assert right >= 19, (noise, wrong, [PAIR_TYPES[i] for i in kinds.tolist()])
 
 
-def test_some_matches_off_the_plane_make_a_pair_general() -> None:
+def test_matches_off_the_plane_make_a_pair_general() -> None:
     planar = classified(pair_evidence(**batch([draw("planar", seed) for seed in range(30)])))
     general = classified(pair_evidence(**batch([draw("planar", seed, off_plane=30) for seed in range(30)])))
     assert [PAIR_TYPES[i] for i in planar.tolist()].count("planar") >= 29

@@ -197,7 +197,7 @@ def test_rejected_steps_are_made_again_with_more_damping_and_end_no_fit() -> Non
     expect_refined(F[rejected], *data, "huber", 8, 1e-3)
 
 
-def test_what_cannot_be_refined_is_told() -> None:
+def test_what_cannot_be_refined_is_reported() -> None:
     F, points, weight, s2 = matches(50)
     F[1], F[2] = 0, np.nan
     fitted, cost = refined(F, points, weight, s2, "truncated", 3, 0.0)

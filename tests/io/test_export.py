@@ -161,7 +161,7 @@ def test_pairs_of_different_scenes_are_not_verified(tmp_path: Path) -> None:
         assert (file.num_matched_image_pairs(), file.num_verified_image_pairs()) == (1, 0)
 
 
-def test_keypoints_are_found_again() -> None:
+def test_keypoints_are_recovered() -> None:
     points = np.array([[1, 2], [3, 4], [1, 2], [5, 6]], np.float32)
     assert io.indices(points, points[[3, 2, 0]]).tolist() == [3, 0, 0]  # of several at one place the first
     assert io.indices(points, points[:0]).shape == (0,)

@@ -145,7 +145,7 @@ def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
         (["images=.", "camera=mine"], "camera=mine; it must be one of: per_image, shared"),
     ],
 )
-def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_are_reported(words: list[str], said: str, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(images)
     with pytest.raises(ValueError, match=said):
         match_command.run(config("match", *words), "sift_ratio")

@@ -77,7 +77,7 @@ def test_what_was_written_is_read(layout: str, swapped: bool, tmp_path: Path) ->
     assert (c.mutual is not None) == (layout == "oanet")
 
 
-def test_the_origin_can_be_told(tmp_path: Path) -> None:
+def test_the_origin_can_be_given(tmp_path: Path) -> None:
     root = writers.write_glue_factory(tmp_path / "glue_factory")
     usual, other = reload("glue_factory", root), reload("glue_factory", root, origin=0.0)
     torch.testing.assert_close(other[0].matches()[0].x0, usual[0].matches()[0].x0 + 0.5)
@@ -225,7 +225,9 @@ def test_names_must_tell_images_apart(tmp_path: Path) -> None:
         ({"layout": "posebench", "root": None}, "h5 needs root"),
     ],
 )  # fmt: skip
-def test_mistakes_are_told(options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_are_errors(
+    options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     writers.truth(tmp_path / "Truth")
     writers.write_hloc(tmp_path / "mine")

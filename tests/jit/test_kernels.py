@@ -129,7 +129,7 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
     assert module.square(3) == 9  # an inner function is also a plain one
 
 
-def test_what_was_compiled_is_kept_and_told_once(tmp_path, cache, capsys):
+def test_what_was_compiled_is_kept_and_reported_once(tmp_path, cache, capsys):
     assert result(load(tmp_path)) == EXPECTED
     messages = capsys.readouterr().err
     assert [line.split(" for ")[0] for line in messages.splitlines()] == ["compiling rows and what else is missing"]
@@ -159,7 +159,7 @@ def start_helper(folder: Path, kernel: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)
 
 
-def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
+def test_the_other_process_compiles_what_it_is_given(module: types.ModuleType, tmp_path: Path) -> None:
     assert start_helper(tmp_path, "some_kernels:rows").wait(300) == 0
     assert module.rows.kept
     assert not module.scaled_squares.kept

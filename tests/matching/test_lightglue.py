@@ -59,7 +59,7 @@ def test_too_few_features_give_no_match(counts: tuple[int, int]) -> None:
     assert c.x0.shape == (1, 0, 2)
 
 
-def test_descriptors_of_another_length_and_unknown_features_are_told() -> None:
+def test_descriptors_of_another_length_and_unknown_features_are_reported() -> None:
     with pytest.raises(ValueError, match=r"descriptors are \(5, 64\).*\(N, 128\)"):
         matcher()(features(0, 5), features(1, 5, length=64))
     with pytest.raises(ValueError, match="aliked, disk, xfeat"):

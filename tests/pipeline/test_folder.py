@@ -131,7 +131,7 @@ def test_workers_that_died_end_the_work(pipeline: Pipeline, images: list[Path], 
     assert kept(tmp_path / "out") == {}
 
 
-def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(pipeline, images, tmp_path):
+def test_an_image_that_ends_its_workers_is_reported_and_the_others_are_matched(pipeline, images, tmp_path):
     assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
     with folder_workers(pipeline, Execution("processes", 1)) as workers:
         matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal_pipeline)

@@ -241,7 +241,7 @@ def test_is_its_formula() -> None:
     assert torch.autograd.gradcheck(lambda *x: pruning.match_noise(*x, **NUMBERS), inputs)
 
 
-def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_usual() -> None:
+def test_matches_without_frames_are_left_as_they_are_and_what_is_unknown_is_usual() -> None:
     stage = presets.build("pruner", "match_noise")
     c = scene(0, 50)
     assert stage(c.replace(lafs0=None, lafs1=None)).noise is None

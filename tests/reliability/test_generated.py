@@ -30,7 +30,7 @@ def generate(folder: Path, calls: int, *names: str) -> list[dict[str, Any]]:
     return lines
 
 
-def test_some_calls_of_everything(tmp_path: Path) -> None:
+def test_calls_of_everything(tmp_path: Path) -> None:
     lines = generate(tmp_path, BOUNDED)
     called = {line["subject"] for line in lines}
     for module in (geometry, metrics, pruning, matching):

@@ -337,7 +337,7 @@ def test_threads_share_a_cache(tmp_path: Path) -> None:
     in_threads(4, lambda number: write_many(cache, 60, 7 * number))
 
 
-def test_what_cannot_be_written_is_told_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_reported_and_harms_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("numpy.savez", full_disk)
     cache = ArrayCache(tmp_path)
     with pytest.warns(UserWarning, match="No space left on device"):

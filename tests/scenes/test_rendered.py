@@ -16,7 +16,8 @@ from fmtorch.scenes import dataset as generation
 from fmtorch.scenes.dataset import generate, read, recorded_pairs, seeds
 from fmtorch.scenes.light import DrawnScene
 from fmtorch.scenes.surfaces import MATERIALS
-from tests.helpers import cross_matrix, in_threads, unused
+from tests.helpers import in_threads, unused
+from tests.reference.solvers import skew
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.2)
 known = functools.cache(build)
@@ -61,7 +62,7 @@ def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> N
         assert pair.problem is None
         assert all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
         assert (pair.F.dtype, np.linalg.norm(pair.F)) == (np.float64, pytest.approx(1.0))
-        F = np.linalg.inv(pair.K1).T @ cross_matrix(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
+        F = np.linalg.inv(pair.K1).T @ skew(pair.t) @ pair.R @ np.linalg.inv(pair.K0)
         np.testing.assert_allclose(F / np.linalg.norm(F), pair.F, atol=1e-12)
         np.testing.assert_allclose(np.linalg.svd(pair.F)[1][2], 0, atol=1e-12)
 

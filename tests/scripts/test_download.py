@@ -149,7 +149,7 @@ def test_archives_cannot_write_elsewhere(members: dict[str, bytes], tmp_path: Pa
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["evil.tgz", "in", "side"]
 
 
-def test_damaged_archives_and_folders_that_are_there_are_told(tmp_path: Path) -> None:
+def test_damaged_archives_and_folders_that_are_there_are_reported(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.tgz", tmp_path / "folder"
     content = archive(path, {"one/a": b"1" * 5000, "two/b": b"2"})
     (folder / "two").mkdir(parents=True)

@@ -11,7 +11,7 @@ from fmtorch.core import Correspondences, pair_key
 from fmtorch.scenes import Plan, RenderedPairs, calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
-from tests.helpers import cross_matrix
+from tests.reference.solvers import skew
 
 TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
 FAMILY = "indoor"  # the quickest to draw
@@ -63,7 +63,7 @@ def _exact_pair(rng: np.random.Generator, n: int, share: float, ignored: float) 
     label = (rng.random(n) < share).astype(np.int8)
     label[rng.random(n) < ignored] = -1
     x1 = np.where(label[:, None] == 0, rng.uniform(0, [499, 299], (n, 2)), x1)
-    F = np.linalg.inv(K1).T @ cross_matrix(t) @ R @ np.linalg.inv(K0)
+    F = np.linalg.inv(K1).T @ skew(t) @ R @ np.linalg.inv(K0)
     frames = [np.concatenate([rng.normal(0, 3, (n, 2, 2)), x[..., None]], -1) for x in (x0, x1)]
     return {
         "x0": x0, "x1": x1, "ratio": rng.uniform(0.3, 1, n), "mutual": rng.random(n) < 0.5,

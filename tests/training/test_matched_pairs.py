@@ -125,7 +125,7 @@ def test_what_would_change_the_matches_has_a_folder_of_its_own(rendered, matched
     assert all((tmp_path / name / "about.json").is_file() for name in names)
 
 
-def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path: Path) -> None:
+def test_pairs_that_fail_are_left_out_and_reported(rendered: RenderedPairs, tmp_path: Path) -> None:
     good = rendered[0]
     gone = dataclasses.replace(good, identity="gone", image1=ImageSource("gone", tmp_path / "gone.png"))
     unusable = dataclasses.replace(good, identity="unusable", problem="line 3: F is zero")

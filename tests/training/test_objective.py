@@ -244,7 +244,7 @@ def test_validation_leaves_the_network_in_its_mode() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(true=st.floats(0.05, 20), seed=st.integers(0, 100))
-def test_temperature_is_the_least_of_the_loss(true: float, seed: int) -> None:
+def test_temperature_minimises_the_loss(true: float, seed: int) -> None:
     """No other temperature is better; logits scaled by s have s times the temperature; calibrated ones about 1."""
     z = 2 * torch.randn(20, 200, generator=generator(seed), dtype=torch.float64)
     label = (torch.rand(20, 200, generator=generator(seed + 1), dtype=torch.float64) < torch.sigmoid(z)).to(torch.int8)

@@ -151,7 +151,7 @@ def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ("validation.monitor=foo", "validation.monitor=foo; it must be one of: log_loss, match_precision"),
     ],
 )  # fmt: skip
-def test_mistakes_are_told_before_anything_is_written(option, message, tmp_path, monkeypatch):
+def test_mistakes_are_reported_before_anything_is_written(option, message, tmp_path, monkeypatch):
     with pytest.raises((ValueError, FileNotFoundError), match=re.escape(message)):
         trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`

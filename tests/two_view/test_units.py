@@ -307,7 +307,7 @@ def test_one_unknown_lens(lens: float) -> None:
     assert all(abs(division.sampson(F, x, (SIZE, SIZE), (lens, lens))) < 2.5 for x in np.c_[x0, x1][inliers])
 
 
-def test_nine_exact_matches_have_the_lens_that_is_found() -> None:
+def test_nine_exact_matches_have_the_estimated_lens() -> None:
     """Fitzgibbon's solver, on samples of the same matches: exact ones tell lambda, noisy ones far worse than all."""
     rng, nearest, own = np.random.default_rng(0), [], []
     for noise in (0.0, 0.3):

@@ -124,7 +124,9 @@ class PairwiseEstimator:
             solutions[i] = Solution(*solved)
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        batch_estimate = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(solutions))
+        batch_estimate = Estimate(
+            F, inliers, ok, tuple(reasons), draws, model=self.model, **_estimated_cameras(solutions)
+        )
         return judged(batch_estimate.to(c.mask.device), c)
 
 
@@ -141,7 +143,7 @@ def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
     return dataclasses.replace(pair, calibrations=(K0, K1), calibrated=exact, shared_focal=shared)
 
 
-def _cameras_found(solutions: list[Solution | None]) -> dict[str, torch.Tensor]:
+def _estimated_cameras(solutions: list[Solution | None]) -> dict[str, torch.Tensor]:
     """Focal lengths and poses where some were estimated, NaN for those of other pairs; t of unit length."""
     fields = {}
     for name, shape in (("focals", (2,)), ("R", (3, 3)), ("t", (3,))):
