@@ -225,9 +225,7 @@ def test_names_must_tell_images_apart(tmp_path: Path) -> None:
         ({"layout": "posebench", "root": None}, "h5 needs root"),
     ],
 )  # fmt: skip
-def test_mistakes_are_errors(
-    options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_raise(options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     writers.truth(tmp_path / "Truth")
     writers.write_hloc(tmp_path / "mine")
