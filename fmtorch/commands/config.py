@@ -28,8 +28,7 @@ from fmtorch.commands.options import COMMANDS, Command
 from fmtorch.core import failures, terminal
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.presets import available, composition
-from fmtorch.presets.files import groups
+from fmtorch.presets import composition
 
 Task = Callable[[DictConfig], None]
 SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
@@ -118,7 +117,7 @@ def _expect_known(overrides: Sequence[str]) -> None:
 def explained(error: HydraException | OmegaConfBaseException, command: str) -> str:
     """One line for an error of Hydra's composition of the config of a command."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        return _missing(str(error.missing_cfg_file), error.options or ())
+        return composition.no_preset(str(error.missing_cfg_file), error.options or ())
     if isinstance(error, OverrideParseException):
         return f"{error.override} cannot be read; a value with special characters stands in quotes: \"NAME='VALUE'\""
     cause = error
@@ -138,16 +137,9 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
     if isinstance(error, ConfigCompositionException) and unknown:
         return f"no option {unknown[1]}; there are: {nearest(unknown[1], COMMANDS[command].names)}"
+    if several := re.search(r"Ambiguous value for argument '([^']+)'", str(error)):
+        return f"{several[1]}: to run with each of several values, add -m"
     return _line(str(error))
-
-
-def _missing(file: str, options: Sequence[str]) -> str:
-    """One line for a preset that there is not; options: those that Hydra found in its folder."""
-    group, _, name = file.partition("/")
-    if group not in groups():
-        group, _, name = file.rpartition("/")
-    there_are = nearest(name, {*(options if "/" not in name else ()), *available(group)})
-    return f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
 
 
 def _line(text: str) -> str:

@@ -95,7 +95,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if pairs and summary[ALL]["failures"] == len(pairs):
         again = f"once that is mended, delete {folder.path} to run again"
         if folder.config.get("code"):
-            again = f"an edit of your parts makes a new run; mended otherwise, delete {folder.path} to run again"
+            again = f"an edit of your parts makes a new run; otherwise delete {folder.path} to run again"
         raise ValueError(f"every pair failed, the first because: {table['reason'][0]}; {again}")
     return folder.path
 
@@ -114,7 +114,11 @@ def _pairs_of(dataset: PairDataset) -> list[ImagePair]:
     ends: dict[str, tuple[ImageSource, ImageSource]] = {}
     twice = [p.identity for p in pairs if ends.setdefault(p.identity, (p.image0, p.image1)) != (p.image0, p.image1)]
     if twice or not pairs:
-        raise ValueError(f"{kind} has two pairs of the identity {twice[0]!r}" if twice else f"{kind} has no pairs")
+        raise ValueError(
+            f"{kind} has two pairs of the identity {twice[0]!r}"
+            if twice
+            else f"the data set {dataset.name} has no pairs"
+        )
     return [p if p.problem or _has_truth(p) else dataclasses.replace(p, problem=NO_TRUTH) for p in pairs]
 
 

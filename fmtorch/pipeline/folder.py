@@ -178,7 +178,7 @@ def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> li
         ordered = sorted(images, key=lambda path: natural_order(path.relative_to(folder).as_posix()))
         return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 : i + 1 + count]]
     if not pairs.is_file():
-        raise ValueError(f"pairs={pairs}: no such file; it must be {CHOICES}, or a file with two names a line")
+        raise ValueError(f"pairs={pairs}: no such file; it must be {CHOICES}, or a file with two names per line")
     return _listed_pairs(folder, images, pairs)
 
 

@@ -124,6 +124,8 @@ class MatchResult:
             report: further entries of `result.json`.
         """
         folder = Path(folder)
+        if folder.is_file():
+            raise ValueError(f"folder={folder} is a file; give a folder, for several files")
         folder.mkdir(parents=True, exist_ok=True)
         drawn = {"matches": True, "pruning": bool(self._pruners), "epipolar": self.ok or truth is not None}
         names = [name for name in get_args(Picture) if drawn[name]]

@@ -16,11 +16,12 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
+from hydra.errors import MissingConfigException
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from fmtorch.core.files import STAGES, conf_dir
-from fmtorch.core.options import Count, dataclass_in, expect_options
+from fmtorch.core.options import Count, dataclass_in, expect_options, nearest
 from fmtorch.core.stages import Pruner
 from fmtorch.jobs.execution import Execution
 from fmtorch.presets import files
@@ -205,11 +206,23 @@ def _composed(config_name: str, overrides: tuple[str, ...], config_dir: Path | N
         try:
             with hydra.initialize_config_dir(str(conf_dir()), version_base=None):
                 return with_explicit(hydra.compose(config_name, [*own, *overrides]), overrides)
+        except MissingConfigException as error:
+            raise ValueError(no_preset(str(error.missing_cfg_file), error.options or ())) from None
         finally:
             GlobalHydra.instance().hydra = hydra_of_caller
 
 
 _kept = functools.lru_cache(maxsize=64)(_composed)
+
+
+def no_preset(file: str, options: Sequence[str]) -> str:
+    """One line for a preset that there is not; options: those that Hydra found in its folder."""
+    group, _, name = file.partition("/")
+    if group not in files.groups():
+        group, _, name = file.rpartition("/")
+    there_are = nearest(name, {*(options if "/" not in name else ()), *files.available(group)})
+    return f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
+
 
 Fields = TypeVar("Fields")
 

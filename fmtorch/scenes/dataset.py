@@ -273,6 +273,10 @@ class RenderedPairs(HeldPairs):
         unknown = [family for family in chosen if family not in FAMILIES]
         if unknown or not chosen:
             raise ValueError(f"unknown families {unknown}; there are {', '.join(FAMILIES)}")
+        held = [] if root is None or not Path(root).is_dir() else sorted(path.name for path in Path(root).iterdir())
+        if others := [name for name in held if not name.startswith((*FAMILIES, "."))]:
+            instead = "give an empty folder, or name the data set that is there, such as dataset=fmbench"
+            raise ValueError(f"root={root} is where rendered scenes are kept, and it holds {others[0]}: {instead}")
         plan = plan or PLANS[size, split]
         home = Path(root) if root is not None else cache_dir() / "rendered"
         digests = {family: digest(family, split, seed, plan) for family in chosen}

@@ -123,10 +123,11 @@ def stages_before_estimation(config: DictConfig) -> Pipeline:
     extractor = cached(features, config.get("cache"), config.get("cache_limit"))
     before = {str(name): presets.build("pruner", str(name)) for name in config.get("before") or ()}
     matcher: Any = presets.instantiate(presets.plain(config.matcher), "matcher")
-    return Pipeline(extractor, matcher, before, _no_estimator)
+    return Pipeline(extractor, matcher, before, no_estimator)
 
 
-def _no_estimator(c: Any, seed: int = 0) -> Any:
+def no_estimator(c: Any, seed: int = 0) -> Any:
+    """What stands for the estimator of a pipeline that ends before it."""
     raise NotImplementedError("the stages before estimation only")
 
 

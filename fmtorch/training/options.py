@@ -8,29 +8,28 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from fmtorch.core.options import CACHE, CACHE_LIMIT, DEBUG, Cache, Count, Debug, Gigabytes, Seed, Within, option
+from fmtorch.core import Within, expect_options
+from fmtorch.core.options import CACHE, CACHE_LIMIT, DEBUG, Cache, Count, Debug, Gigabytes, Seed, option
 
 Real = float | int
 Range = Sequence[Real]  # the least and the most
-COORDINATES = ("size", "K")
+Weight = Annotated[float, Within(0)]
+Probability = Annotated[Real, Within(0, 1)]
 
 
 @dataclasses.dataclass(frozen=True)
 class PlaneViews:
     """How views of photographs, as planes, are drawn; ranges are uniform, of ratios in their logarithm."""
 
-    views: int = option(5, "of each photograph, drawn on first use; every two of them are a pair")
-    tilt: Real = option(60.0, "degrees between the optical axis and the plane's normal, at most")
-    roll: Real = option(15.0, "degrees, standard deviation of the turn about the axis")
+    views: Annotated[int, Within(2)] = option(5, "of each photograph, drawn on first use; every two of them are a pair")
+    tilt: Annotated[Real, Within(0, 80)] = option(60.0, "degrees of the optical axis to the plane's normal, at most")
+    roll: Annotated[Real, Within(0)] = option(15.0, "degrees, standard deviation of the turn about the axis")
     part: tuple[Real, Real] = option((0.5, 1.0), "of the photograph's width that a view spans")
     scale: tuple[Real, Real] = option((0.7, 1.0), "sides of a view, of the photograph's")
     focal: tuple[Real, Real] = option((0.7, 1.8), "in widths of the view")
 
     def __post_init__(self) -> None:
-        if self.views < 2:
-            raise ValueError(f"planes.views={self.views}; a pair needs 2")
-        if not 0 <= self.tilt < 80 or self.roll < 0:
-            raise ValueError(f"planes.tilt={self.tilt}, roll={self.roll}: 0 <= tilt < 80 degrees, roll not negative")
+        expect_options(type(self), vars(self), "planes")
         for name in ("part", "scale", "focal"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
@@ -53,19 +52,12 @@ class Planes(PlaneViews):
 class Optimisation:
     """Adam (Kingma & Ba, ICLR 2015) at a constant rate that falls linearly to zero over the last part of the steps."""
 
-    learning_rate: float = option(
+    learning_rate: Annotated[float, Within(0, exclusive=True)] = option(
         1e-3, "Adam, as in Yi et al. 2018's code; the 1e-4 that one paper states is known to be a mistake"
     )
-    weight_decay: float = option(0.0, "L2 penalty of the parameters")
-    steps: int = option(2500, "in all")
-    decay: float = option(0.5, "share of the steps, at the end, over which the learning rate falls to zero")
-
-    def __post_init__(self) -> None:
-        if not self.learning_rate > 0 or self.weight_decay < 0 or self.steps < 1 or not 0 <= self.decay <= 1:
-            raise ValueError(
-                f"optimisation={dataclasses.asdict(self)}: learning_rate and steps must be positive, weight_decay "
-                "not negative, decay between 0 and 1"
-            )
+    weight_decay: Weight = option(0.0, "L2 penalty of the parameters")
+    steps: Count = option(2500, "in all")
+    decay: Probability = option(0.5, "share of the steps, at the end, over which the learning rate falls to zero")
 
     def factor(self, step: int) -> float:
         """What the learning rate is multiplied by at a step."""
@@ -76,27 +68,26 @@ class Optimisation:
 class ObjectiveWeights:
     """The terms of the loss and their weights."""
 
-    classification: float = option(
+    classification: Weight = option(
         1.0, "weight of the cross-entropy of P(inlier) (Yi et al., CVPR 2018, eq. 7, without class balance)"
     )
-    geometric: float = option(
+    geometric: Weight = option(
         0.5,
         "weight of the symmetric epipolar distance of virtual points of the true geometry to the weighted 8-point fit "
         "(Ranftl & Koltun, ECCV 2018; clamped as by Zhang et al., ICCV 2019)",
     )
-    nsgd: float = option(0.0, "weight of NSGD between that fit and the truth, in image diagonals")
+    nsgd: Weight = option(0.0, "weight of NSGD between that fit and the truth, in image diagonals")
     nsgd_limit: float | None = option(0.2, "of a pair's NSGD, beyond which it has no gradient")
-    coordinates: str = option(
+    coordinates: Literal["size", "K"] = option(
         "size", "unit of the geometric term: size (half the longest side, clamped at 0.03) or K (focal lengths, at 0.1)"
     )
-    classification_steps: int = option(500, "steps of classification alone, before the other two terms come in")
-    points: int = option(100, "virtual points of a pair")
+    classification_steps: Annotated[int, Within(0)] = option(
+        500, "steps of classification alone, before the other two terms come in"
+    )
+    points: Count = option(100, "virtual points of a pair")
 
     def __post_init__(self) -> None:
-        if self.coordinates not in COORDINATES:
-            raise ValueError(f"objective.coordinates={self.coordinates}; it must be one of: {', '.join(COORDINATES)}")
-        if min(self.classification, self.geometric, self.nsgd, self.classification_steps) < 0 or self.points < 1:
-            raise ValueError("objective: weights and classification_steps must not be negative, points at least 1")
+        expect_options(type(self), vars(self), "objective")
         if not max(self.classification, self.geometric, self.nsgd) > 0:
             raise ValueError("objective: at least one of classification, geometric and nsgd must have a weight")
 
@@ -105,14 +96,14 @@ class ObjectiveWeights:
 class AugmentationOptions:
     """Random changes of a pair's labelled matches, after which the truth is still true; None turns a change off."""
 
-    swap: Real = option(0.5, "probability that the images change places")
-    quarter_turn: Real = option(0.1, "probability, for each image, of a turn by 90, 180 or 270 degrees")
-    turn: Real = option(0.2, "or else by any angle,")
+    swap: Probability = option(0.5, "probability that the images change places")
+    quarter_turn: Probability = option(0.1, "probability, for each image, of a turn by 90, 180 or 270 degrees")
+    turn: Probability = option(0.2, "or else by any angle,")
     angle: Real = option(45.0, "degrees, either way, at most")
-    crop: Real = option(0.3, "probability, for each image, of a crop, which moves the principal point")
+    crop: Probability = option(0.3, "probability, for each image, of a crop, which moves the principal point")
     crop_side: Range = option((0.6, 1.0), "sides of a crop, of the image's")
     ratio: Range | None = option((0.8, 1.0), "threshold of the ratio test")
-    thin: Real = option(0.5, "probability that inliers or outliers are thinned")
+    thin: Probability = option(0.5, "probability that inliers or outliers are thinned")
     inlier_share: Range = option((0.05, 0.95), "to a share of inliers in this range")
     noise: Range | None = option((0.0, 0.5), "px, standard deviation of the error added to both points")
     matches: Sequence[int] | None = option(
@@ -120,9 +111,7 @@ class AugmentationOptions:
     )
 
     def __post_init__(self) -> None:
-        for name in ("swap", "quarter_turn", "turn", "crop", "thin"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it is a probability, from 0 to 1")
+        expect_options(type(self), vars(self), "augmentation")
         if self.quarter_turn + self.turn > 1:
             raise ValueError("quarter_turn and turn exclude each other: together they are at most 1")
         for name, low, high in (

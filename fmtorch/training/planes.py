@@ -60,7 +60,8 @@ def list_photographs(
     allowed = [each for each in photographs if sources is None or each[1] in sources]
     kept = [Photograph(path, own) for path, own, full in allowed if not any(part in full for part in excluded)]
     if not kept:
-        raise ValueError(f"{folder}: none of its {len(photographs)} photographs is left by sources and excluded")
+        left = f"none of its {len(photographs)} photographs is left by sources and excluded"
+        raise ValueError(f"{folder}: {left}" if photographs else f"{folder} holds no photographs")
     return kept
 
 

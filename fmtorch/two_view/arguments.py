@@ -59,6 +59,8 @@ def correspondences(
     x0, x1: whole numbers become float64, half precision float32; x0 decides the device. plane: x0 may be in the unit of
     a plane. fields: of `Correspondences`, or None. Raises TypeError for what is no array of numbers, ValueError for
     wrong shapes, values that cannot be, a calibration that is none, and points of no pixels."""
+    if (fields.get("lafs0") is None) != (fields.get("lafs1") is None):
+        raise ValueError("of lafs0 and lafs1 one is given; give both, or neither")
     cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
     c = _batch(x0, x1, {**fields, **cameras, **lens_fields(lens)})
     if lens is not None and c.stretch is not None:

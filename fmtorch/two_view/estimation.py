@@ -33,6 +33,8 @@ def estimated(
     model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
     the estimate may have a covariance. assume_sizes: whether sizes that are not given may be taken from the points."""
     seed = int(number("seed", seed, integer=True))
+    if not isinstance(name, str):
+        raise TypeError(f"estimator is of type {type(name).__name__}; it must be the name of a preset")
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:

@@ -20,8 +20,6 @@ from fmtorch.geometry.pose import pose_from_fundamental
 
 Lenses = tuple[Lens | None, Lens | None]  # of both images of a pair; None of a pinhole
 FORMS = "a lens for both images, (lens0, lens1) with None for a pinhole, or a list of (lens0, lens1), one for each pair"
-
-
 GRID = 9  # points along each side of an image that tell whether a lens folds it
 MAX_STRETCH = 100.0  # of a match in both images: 3 degrees from across the axes of fish-eyes
 

@@ -6,6 +6,8 @@ import importlib
 import cv2
 import torch
 
+from fmtorch.core.terminal import exits_with_message
+
 if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
@@ -20,7 +22,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    arguments.run(arguments)
+    with exits_with_message():
+        arguments.run(arguments)
 
 
 if __name__ == "__main__":

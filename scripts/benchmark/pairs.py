@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from fmtorch import data, presets
-from fmtorch.core.types import Correspondences, Estimate, pair_key
+from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data import ImagePair, ImageSource, PairDataset
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation.run import select
@@ -21,6 +21,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.runs.feature_cache import cached
 from fmtorch.scenes import RenderedPairs, surfaces
 from fmtorch.scenes import dataset as generate
+from fmtorch.training.matched_pairs import no_estimator
 from scripts.benchmark import methods
 from scripts.benchmark.runner import Item, Kept, Row, Stages, identity
 
@@ -99,10 +100,6 @@ def items(pairs: Iterable[ImagePair], front: Pipeline) -> list[Item]:
         return front.correspondences([pair])[0]
 
     return [Item(p, functools.partial(matched, p), images=functools.partial(front.images, p)) for p in pairs]
-
-
-def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
-    raise NotImplementedError("matches alone are asked for")
 
 
 def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:

@@ -30,6 +30,7 @@ from fmtorch.features import ASIFT
 from fmtorch.features.describe import codebook, descriptor_kind, local_descriptors, vlad
 from fmtorch.pipeline import Outcome, Pipeline, describe
 from fmtorch.pipeline.folder import similar_pairs
+from fmtorch.training.matched_pairs import no_estimator
 from scripts.benchmark import pairs, tables
 from scripts.benchmark.methods import pipeline_method, pipeline_of
 from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
@@ -112,7 +113,7 @@ def measured(known: Mapping[str, str], every: Sequence[ImagePair], arguments: An
         overrides = f"cache={arguments.cache}", *arguments.overrides
         method, pipeline, front = pipeline_method(name + arguments.label, words, *overrides)
         if front not in groups:
-            shared = Pipeline(pipeline.extractor, pipeline.matcher, {}, pairs.no_estimator, model=None)
+            shared = Pipeline(pipeline.extractor, pipeline.matcher, {}, no_estimator, model=None)
             groups[front] = shared, []
         groups[front][1].append(method)
     rows: list[Row] = []

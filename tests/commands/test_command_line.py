@@ -104,6 +104,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: s
         ("match .", ". is a folder; fmtorch match images=. matches its images with one another"),
         ("eval --config-dir nowhere", "nowhere' not found"),
         ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
+        ("eval estimator=ransac,lmeds", "estimator=ransac,lmeds: to run with each of several values, add -m"),
         ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
         ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
         ("match a.png b.png output=", "output is empty; give a path, or leave it out"),
@@ -225,8 +226,8 @@ def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixtur
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"usage: fmtorch {command}")
     assert len(lines) < 60
-    told = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
-    assert told >= set(COMMANDS[command].names)
+    listed = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
+    assert listed >= set(COMMANDS[command].names)
     if command == "match":
         runs = [line.strip() for line in lines if line.strip().startswith(("features=", "pruner="))]
         assert runs == ["features=hesaffnet_fast", "pruner=[ratio, one_to_one, frame_consistency]"]

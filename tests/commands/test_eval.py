@@ -56,7 +56,7 @@ def test_pairs_of_anybodys_data_set_are_checked() -> None:
     refused: list[tuple[list[ImagePair], str]] = [
         ([pair, dataclasses.replace(pair, image0=pair.image1)], f"two pairs of the identity '{pair.identity}'"),
         ([dataclasses.replace(pair, image0="a.png")], "image0 is a str; images are ImageSource"),  # type: ignore[arg-type]
-        ([], "OwnPairs has no pairs"),
+        ([], "the data set own has no pairs"),
     ]
     for pairs, said in refused:
         with pytest.raises(ValueError, match=re.escape(said)):
@@ -154,7 +154,6 @@ def test_a_data_set_that_is_something_else(data: list[str], command: RunCommand,
         ("pruner=lc pruner.lc.file=runs/absent", "absent.safetensors does not exist: fmtorch train pruner=lc"),
         ("dataset.root=nowhere", "nowhere: no such folder"),
         ("lens=-0.6", "it is lambda in half diagonals, from -0.45 to 0.2"),
-        ("lens=[null,0]", "lens is [None, 0]; it must be None"),
         ("lens=[[0,0.1],[-0.6,0]]", "lens of image 1 of pair 0 is [-0.6, 0.0]"),
         ("device=cuda", "sees no CUDA device"),
         ("estimator.score=psac", "score is 'psac'"),

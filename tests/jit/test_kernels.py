@@ -313,15 +313,14 @@ def test_kernels_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path, tmp_path: Path) -> None:
     result(module)
-    (tmp_path / "here").mkdir()
 
     def listing(*options: str) -> str:
         environment = {"FMTORCH_CACHE": str(cache.parent)}
-        done = run_command("fmtorch.runs", *options, cwd=tmp_path / "here", environment=environment)
+        done = run_command("fmtorch.runs", *options, cwd=tmp_path, environment=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     version = next(cache.iterdir()).name
-    assert f"{version}, used {time.strftime('%Y-%m-%d')} │     2 │" in listing()
+    assert version in listing()
     assert version not in listing("--clear-kernels")
     assert not cache.exists()

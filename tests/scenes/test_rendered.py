@@ -188,11 +188,13 @@ def test_two_at_once_do_not_clash(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == [task.name]
 
 
-def test_unknown_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="unknown families"):
-        RenderedPairs(families=["underwater"], root=tmp_path)
-    with pytest.raises(ValueError, match="no split"):
-        RenderedPairs("validation", root=tmp_path)
+def test_unknown_names_and_folders_of_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "Images").mkdir()
+    for said, split, families in (
+        ("unknown families", "test", ["underwater"]), ("no split", "validation", None), ("holds Images", "test", None),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            RenderedPairs(split, families=families, root=tmp_path)
 
 
 @pytest.mark.usefixtures("_built_once")

@@ -402,7 +402,7 @@ def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs, tmp_p
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
     turns = {"turn": 0.6, "quarter_turn": 0.6}
-    for options, message in (({"swap": 2}, "swap is 2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
+    for options, message in (({"swap": 2}, "swap=2"), (turns, "exclude"), ({"ratio": (1.0, 0.8)}, "ratio is")):
         with pytest.raises(ValueError, match=message):
             Augmentation(**options)
     with pytest.raises(ValueError, match="batch of 2"):

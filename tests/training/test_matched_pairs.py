@@ -141,6 +141,7 @@ def test_pairs_that_fail_are_left_out_and_reported(rendered: RenderedPairs, tmp_
         ([unusable], "sift_ratio", SIFT["overrides"], "1 of 1 pairs have no matches"),
         ([], "sift_ratio", SIFT["overrides"], "no pairs"),
         ([good], "sift", (), "no preset 'sift'"),
+        ([good], "sift_ratio", ["pruner=[one_to_on]"], "no preset 'one_to_on' in pruner; there are: one_to_one"),
         ([good], stages, ["pruner=[]"], "overrides"),
         ([good], nameless, (), "cannot be kept"),
     ):

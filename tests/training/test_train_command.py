@@ -140,13 +140,13 @@ def test_oanets_files_are_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("planes.views=1", "planes.views=1; a pair needs 2"),
+        ("planes.views=1", "planes.views=1; it must be a whole number of at least 2"),
         ("planes.views=many", "planes.views=many; it must be a whole number"),
         ("planes.photographs=nothing", "nothing is no folder of photographs"),
         ("pruner=ratio", "pruner=lc has nothing to train"), ("seed=0", "nowhere: no such folder"),
         ("batch=0", "batch=0; it must be a whole number of at least 1"),
         ("limit=-3", "limit=-3; it must be a whole number of at least 1"),
-        ("optimisation.steps=0", "learning_rate and steps must be positive"),
+        ("optimisation.steps=0", "optimisation.steps=0; it must be a whole number of at least 1"),
         ("objective.coordinates=pixels", "it must be one of: size, K"),
         ("validation.monitor=foo", "validation.monitor=foo; it must be one of: log_loss, match_precision"),
     ],

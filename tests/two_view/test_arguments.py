@@ -161,6 +161,8 @@ WRONG_TYPES = {
     "find_fundamental([[1, 2], [3]], x)": "TypeError: x0 is a list of uneven rows; it must be an array or a tensor",
     "find_fundamental(x, x, ratio=object())": f"TypeError: ratio is a object of object; {NUMBERS}",
     "find_fundamental([x], [x], prior=0.5)": "ValueError: prior must be a list of 1 arrays, one for each pair of x0",
+    "find_fundamental(x, x, lafs1=x)": "ValueError: of lafs0 and lafs1 one is given; give both, or neither",
+    "find_fundamental(x, x, estimator=x)": "TypeError: estimator is of type ndarray; it must be the name of a preset",
     "match(None, image)": f"TypeError: image0 is a NoneType; {IMAGE}",
     "match(image, [1, 2])": f"TypeError: image1 is a list; {IMAGE}",
     "match(b'a.jpg', b'b.jpg')": f"TypeError: image0 is a bytes; {IMAGE}",
