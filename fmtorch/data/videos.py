@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -29,7 +30,7 @@ class KittiPairs(ScenePairs):
 
     def __init__(
         self, root: str | Path | None = None, split: str = "test", sequences: Sequence[str] | None = None,
-        camera: int = 0, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
+        camera: Literal[0, 1, 2, 3] = 0, window: int | float = WINDOW, pairs: int | None = 1000, seed: int = 0,
     ) -> None:  # fmt: skip
         home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
