@@ -336,7 +336,7 @@ def lenses_of(pair: Pair, search: FocalSearch) -> Array:
     best = _best(fits, prior, pair, scale)
     if unknown.all():
         none = np.zeros(2)
-        pinholes = [_from(fit._replace(lens=none), STRAIGHT, pair, START_SCALE_PX, START_ITERATIONS) for fit in fits]
+        pinholes = [_refined(fit._replace(lens=none), STRAIGHT, pair) for fit in fits]
         if not best.evidence > _straight_evidence(_best(pinholes, STRAIGHT, pair, scale), pair):
             return mean
     return best.lens
@@ -352,13 +352,15 @@ def _round(at: Array, prior: LensPrior, pair: Pair, search: FocalSearch) -> list
     return sorted((fit for fit in fits if math.isfinite(fit.cost)), key=lambda fit: fit.cost)[:1]
 
 
-def _from(fit: LensFit, prior: LensPrior, pair: Pair, scale_px: float, iterations: int) -> LensFit:
+def _refined(
+    fit: LensFit, prior: LensPrior, pair: Pair, scale_px: float = START_SCALE_PX, iterations: int = START_ITERATIONS
+) -> LensFit:  # fmt: skip
     return fit_with_lenses(fit.cameras, fit.lens[None], prior, pair, scale_px, iterations)[0]
 
 
 def _best(fits: list[LensFit], prior: LensPrior, pair: Pair, scale: float) -> LensFit:
     """The fit of greatest evidence at a scale near these."""
-    return max((_from(fit, prior, pair, scale, ITERATIONS) for fit in fits), key=lambda fit: fit.evidence)
+    return max((_refined(fit, prior, pair, scale, ITERATIONS) for fit in fits), key=lambda fit: fit.evidence)
 
 
 def lens_fit(lens: Array, cameras: Cameras, pair: Pair, inliers: Array) -> Fit:
@@ -405,22 +407,19 @@ def suggested_lens(fit: Fit, pair: Pair) -> float:
         posterior.nearest_cameras(fit.F[None], images_of(pair), cameras)
     (pinholes,) = fit_with_lenses(cameras, np.zeros((1, 2)), SHARED, pair, START_SCALE_PX, 0)
 
-    def refined(start: LensFit, prior: LensPrior) -> LensFit:
-        return _from(start, prior, pair, START_SCALE_PX, START_ITERATIONS)
-
     def suspicious(lens: float, deviation: float) -> bool:
         return contradicted or abs(lens) > max(SUSPICIOUS_LENS, SUSPICIOUS_DEVIATIONS * deviation)
 
     step = float((pinholes.inverse[LENS] * pinholes.gradient).sum())
     if not suspicious(step, float(pinholes.deviation[0])):
         return math.nan
-    near = refined(pinholes, SHARED)
+    near = _refined(pinholes, SHARED, pair)
     if not suspicious(float(near.lens[0]), float(near.deviation[0])):
         return math.nan
-    fits = [near, *(refined(pinholes._replace(lens=np.array(start)), SHARED) for start in STARTS[1:])]
+    fits = [near, *(_refined(pinholes._replace(lens=np.array(start)), SHARED, pair) for start in STARTS[1:])]
     scale = _noise_scale(min(fits, key=lambda fit: fit.cost), pair)
     best = _best(fits, SHARED, pair, scale)
-    without = _straight_evidence(_best([refined(pinholes, STRAIGHT)], STRAIGHT, pair, scale), pair)
+    without = _straight_evidence(_best([_refined(pinholes, STRAIGHT, pair)], STRAIGHT, pair, scale), pair)
     lens, deviation = float(best.lens[0]), float(best.deviation[0])
     clear = abs(lens) > max(SUGGESTED_LENS, SUGGESTED_DEVIATIONS * deviation)
     return lens if clear and best.evidence - without > SUGGESTED_GAIN else math.nan

@@ -237,18 +237,9 @@ class H5Pairs(HeldPairs):
         digest = hashlib.blake2b(repr((layout, origin)).encode(), digest_size=16)
         if layout in WITH_GEOMETRY:
             _expect_unset(layout, truth=truth, features=features, matches=matches, origin=origin)
-            where = None if images is None else Path(images).expanduser()
-            if where is not None and not where.is_dir():
-                raise DataError(f"images={images}: no such folder; it must hold the images that the layout names")
-            self._pairs = list(WITH_GEOMETRY[layout](folder, where))
-            if where is not None:
-                _expect_distinct(self._pairs, where)
-            if layout == "ransac_tutorial":
-                files = [path for scene in scenes(folder) for name in TUTORIAL if (path := scene / name).exists()]
-            else:
-                files = h5.files(folder)
+            self._pairs, files = _pairs_with_geometry(folder, layout, images)
         else:
-            _expect_unset(layout, images=images)
+            _expect_unset(layout, images=images, **({} if layout == "hloc" else {"features": features}))
             if truth is None:
                 needed = (
                     "give dataset.truth=SET (a report: root=[FILES,SET]), the `fmbench` set that it was computed on"
@@ -261,7 +252,6 @@ class H5Pairs(HeldPairs):
                 files = [_file_of_kind(folder, features, "features"), _file_of_kind(folder, matches, "matches")]
                 self._pairs = list(predictions.hloc_pairs(known, files[0], files[1], offset))
             else:
-                _expect_unset(layout, features=features)
                 files = [_file_of_kind(folder, matches, "matches") if matches else _only(folder)]
                 self._pairs = list(predictions.predicted_pairs(known, files[0], offset))
         for path in files:
@@ -269,6 +259,19 @@ class H5Pairs(HeldPairs):
         if not self._pairs:
             raise DataError(f"{folder}: holds no pairs")
         self.digest = digest.hexdigest()
+
+
+def _pairs_with_geometry(folder: Path, layout: str, images: str | Path | None) -> tuple[list[ImagePair], list[Path]]:
+    """The pairs of a layout that has their geometry, and the files that hold them."""
+    where = None if images is None else Path(images).expanduser()
+    if where is not None and not where.is_dir():
+        raise DataError(f"images={images}: no such folder; it must hold the images that the layout names")
+    pairs = list(WITH_GEOMETRY[layout](folder, where))
+    if where is not None:
+        _expect_distinct(pairs, where)
+    if layout != "ransac_tutorial":
+        return pairs, h5.files(folder)
+    return pairs, [path for scene in scenes(folder) for name in TUTORIAL if (path := scene / name).exists()]
 
 
 def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:

@@ -89,45 +89,44 @@ class PairwiseEstimator:
                 "estimator of this project"
             )
         b, n = c.mask.shape
-        F = torch.zeros(b, 3, 3, dtype=torch.float64)
-        inliers = torch.zeros(b, n, dtype=torch.bool)
-        solutions: list[Solution | None] = [None] * b
-        reasons, batch = [""] * b, Batch.of(c.to("cpu"))
-        for i in range(b):
-            matches = batch.pair(i)
-            normalized = batch.normalized(matches, i, seed, MIN_MATCHES)
-            if isinstance(normalized, str):
-                reasons[i] = normalized
-                continue
-            pair, slot = normalized
-            value = torch.ones(n) if c.ambiguity is None else 1 - c.ambiguity[i]
-            likelihood = (value if c.prior is None else c.prior[i]).detach().cpu().double()[slot].numpy()
-            order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
-            x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
-            sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
-            given = _with_cameras(Pair(x0, x1, likelihood[order], *sizes, seed), batch, i)
-            inside = np.zeros(len(slot), np.bool_)
-            try:
-                solved = self._solve(given)
-                estimate, inside[order] = solved[:2]
-            except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
-                reasons[i] = f"{self.name} failed: {_said(failure)}"
-                continue
-            if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
-                reasons[i] = f"{self.name} found no {self.model}{' matrix' * (self.model == 'fundamental')}"
-                continue
-            reasons[i] = degenerate_support(pair, inside, MINIMAL_SAMPLES[self.model], relative_rounding(c))
-            if reasons[i]:
-                continue
-            F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
-            inliers[i, torch.from_numpy(slot[inside])] = True
-            solutions[i] = Solution(*solved)
+        batch = Batch.of(c.to("cpu"))
+        solved = [self._solved(c, batch, i, seed) for i in range(b)]
+        reasons = tuple(each if isinstance(each, str) else "" for each in solved)
+        solutions = [None if isinstance(each, str) else each for each in solved]
+        F, inliers = torch.zeros(b, 3, 3, dtype=torch.float64), torch.zeros(b, n, dtype=torch.bool)
+        for i, solution in enumerate(solutions):
+            if solution is not None and solution.F is not None:
+                F[i] = torch.from_numpy(solution.F / np.linalg.norm(solution.F))
+                inliers[i] = torch.from_numpy(solution.inliers)
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        batch_estimate = Estimate(
-            F, inliers, ok, tuple(reasons), draws, model=self.model, **_estimated_cameras(solutions)
-        )
-        return judged(batch_estimate.to(c.mask.device), c)
+        estimate = Estimate(F, inliers, ok, reasons, draws, model=self.model, **_estimated_cameras(solutions))
+        return judged(estimate.to(c.mask.device), c)
+
+    def _solved(self, c: Correspondences, batch: Batch, i: int, seed: int) -> Solution | str:
+        """The solution of pair i with the inliers of all its slots, or why it has none."""
+        matches = batch.pair(i)
+        normalized = batch.normalized(matches, i, seed, MIN_MATCHES)
+        if isinstance(normalized, str):
+            return normalized
+        pair, slot = normalized
+        value = torch.ones(c.mask.shape[1]) if c.ambiguity is None else 1 - c.ambiguity[i]
+        likelihood = (value if c.prior is None else c.prior[i]).detach().cpu().double()[slot].numpy()
+        order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
+        x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
+        sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
+        inside, inliers = np.zeros(len(slot), np.bool_), np.zeros(c.mask.shape[1], np.bool_)
+        try:
+            solution = Solution(*self._solve(_with_cameras(Pair(x0, x1, likelihood[order], *sizes, seed), batch, i)))
+            inside[order] = solution.inliers
+        except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
+            return f"{self.name} failed: {_said(failure)}"
+        F = solution.F
+        if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not np.any(F):
+            return f"{self.name} found no {self.model}{' matrix' * (self.model == 'fundamental')}"
+        inliers[slot[inside]] = True
+        reason = degenerate_support(pair, inside, MINIMAL_SAMPLES[self.model], relative_rounding(c))
+        return reason or solution._replace(inliers=inliers)
 
 
 def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
