@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fmtorch.core.lenses import MODELS, Lens, Matrix, division, division_lens, folded, lines_of_sight, undistortion
 from fmtorch.core.types import MAX_LENS, MIN_LENS, Correspondences, Estimate
-from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION
+from fmtorch.estimators.lens_search import STARTS, TAIL_DEVIATION, TAIL_MEAN
 from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt
 from fmtorch.geometry.cameras import calibration_problems, cross_matrix
 from fmtorch.geometry.epipolar import mean_stretch
@@ -251,5 +251,5 @@ def _fitted_lenses(c: Correspondences, models: Matrix) -> Matrix:
     straight = min((fit(each[:8], noise(start)) for each in (starts[0], start)), key=lambda fit: fit.cost)
     A, lens = bent.jac.T @ bent.jac + np.diag([0.0] * 8 + [TAIL_DEVIATION**-2] * count), bent.x[8:]
     volume = np.linalg.slogdet(A)[1] - np.linalg.slogdet(A[:8, :8])[1] + 2 * count * np.log(TAIL_DEVIATION)
-    evidence = straight.cost - bent.cost - (lens**2).sum() / TAIL_DEVIATION**2 / 2 - volume / 2
+    evidence = straight.cost - bent.cost - ((lens - TAIL_MEAN) ** 2).sum() / TAIL_DEVIATION**2 / 2 - volume / 2
     return np.broadcast_to(lens.clip(MIN_LENS, MAX_LENS) if evidence > 0 else 0.0, 2).copy()
