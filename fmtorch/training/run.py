@@ -406,14 +406,14 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
             progress=terminal.reporter(progress, f"matches {what}"), labels=labels,
         )  # fmt: skip
 
-    training = matched(dataset, chosen, "to train on")
-    digests, validation = [training.digest], list[tuple[ImagePair, LabelledMatches]]()
     sets = [(dataset, held_out, "to validate on")]
     for root in validated.roots:
         path = Path(root).expanduser()
         of_matches = path.suffix in h5.SUFFIXES or any(file.suffix in h5.SUFFIXES for file in path.glob("*"))
         real = _oanet_pairs(path, config, options) if of_matches else data.load("fmbench", root=root)
         sets.append((real, list(range(len(real))), f"of {root}"))
+    training = matched(dataset, chosen, "to train on")
+    digests, validation = [training.digest], list[tuple[ImagePair, LabelledMatches]]()
     for source, indices, what in sets:
         if selected := _limited(source, indices, validated.pairs):
             stored = matched(source, selected, what)
