@@ -1,6 +1,7 @@
 """`python -m fmtorch.runs [DIR]`: what the cache folder holds of features, compiled kernels, scenes and matches."""
 
 import argparse
+import contextlib
 import shutil
 import time
 from pathlib import Path
@@ -25,9 +26,10 @@ def main() -> None:
         shutil.rmtree(kernels_dir())
     held: dict[str, list[tuple[int, float]]] = {}
     for file in sorted(options.folder.rglob("*")):
-        if file.is_file():
-            name, status = "/".join(file.parent.relative_to(options.folder).parts[:2]), file.stat()
-            held.setdefault(name, []).append((status.st_size, status.st_mtime))
+        with contextlib.suppress(FileNotFoundError):  # which another process has just removed
+            if file.is_file():
+                name, status = "/".join(file.parent.relative_to(options.folder).parts[:2]), file.stat()
+                held.setdefault(name, []).append((status.st_size, status.st_mtime))
     table = Table("folder", title=f"{options.folder}: {sum(map(len, held.values())):,} files")
     for heading in ("files", "MB", "last used"):
         table.add_column(heading, justify="right")
