@@ -260,7 +260,7 @@ MAX_WORKERS = 8  # by default: each holds an image and its scale space
 PRELOADED = (__name__,)  # by the process that workers are forked of
 
 
-class Photograph(NamedTuple):
+class ImageToDescribe(NamedTuple):
     """An image to describe, as `read_image` and `describe` take it; in place of `image`, why there is none."""
 
     path: Path
@@ -279,7 +279,7 @@ class DescribedPair(NamedTuple):
     known: Mapping[str, Any]
 
 
-def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | StoredPair | str:
+def described_or_matched(pipeline: Pipeline, task: ImageToDescribe | DescribedPair) -> Described | StoredPair | str:
     """What a worker does, by one thread: an image's features, what a journal keeps of a pair, or what went wrong."""
     try:
         with one_thread(pipeline.device):
@@ -349,7 +349,7 @@ class FolderMatches:
     def _passed(self) -> int:
         return self.done + self.taken + self._failed
 
-    def _tasks(self, pairs: Sequence[Pair]) -> Iterator[Photograph | DescribedPair | None]:
+    def _tasks(self, pairs: Sequence[Pair]) -> Iterator[ImageToDescribe | DescribedPair | None]:
         """Pairs as soon as their images are described, and before them these; None where others must end first."""
         todo = iter(in_blocks(pairs, MEMORY // 2))
         ahead = max(MEMORY // 2, AHEAD * self.workers.size)
@@ -379,14 +379,14 @@ class FolderMatches:
             else:
                 return
 
-    def _photograph(self, image: Path) -> Photograph:
+    def _photograph(self, image: Path) -> ImageToDescribe:
         try:
             source: ImageSource | str = self.cameras.source(image)
             if self.workers.execution.send_images:
                 source = dataclasses.replace(source, data=image.read_bytes())  # type: ignore[type-var]
         except (DataError, OSError) as error:  # no camera, or no file
             source = in_a_line(error)
-        return Photograph(image, source, self.longest_side, self.orient)
+        return ImageToDescribe(image, source, self.longest_side, self.orient)
 
     def _described_pair(self, pair: Pair) -> DescribedPair | None:
         end0, end1 = (self._described[image] for image in pair)
@@ -401,10 +401,10 @@ class FolderMatches:
             return None
         return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
-    def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
+    def _keep(self, task: ImageToDescribe | DescribedPair, result: Any) -> None:
         trouble, _, trace = (result if isinstance(result, str) else self._not_stored(task, result)).partition("\n")
         self.tracebacks |= {trace: None} if trace else {}
-        if isinstance(task, Photograph):
+        if isinstance(task, ImageToDescribe):
             self._described[task.path] = None if trouble else result
             self._troubles |= {(task.path,): trouble} if trouble else {}
         elif trouble:
@@ -413,7 +413,7 @@ class FolderMatches:
             self.done += 1
             self.related += result.related
 
-    def _not_stored(self, task: Photograph | DescribedPair, result: Any) -> str:
+    def _not_stored(self, task: ImageToDescribe | DescribedPair, result: Any) -> str:
         """Add an image or a pair to the journal; why it cannot be, else empty."""
         try:
             if isinstance(task, DescribedPair):

@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fmtorch.estimators.external import pairwise
-from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Solution
+from fmtorch.estimators.external.pairwise import Confidence, Iterations, PairwiseEstimator, PixelPair, Solution
 from fmtorch.estimators.refinement import Pixels
 
 USUAL_FOCAL = 1.2  # in units of the longer side, of a camera without a prior: COLMAP's default
@@ -36,14 +36,14 @@ def colmap(
     """
     library = pairwise.peer("pycolmap", "COLMAP", extra="colmap")
 
-    def settings(pair: Pair) -> Any:
+    def settings(pair: PixelPair) -> Any:
         options = library.TwoViewGeometryOptions(compute_relative_pose=True)
         options.ransac.max_error, options.ransac.random_seed = threshold, pair.seed % MAX_SEED
         options.ransac.confidence, options.ransac.max_num_trials = confidence, iterations
         options.ransac.min_num_trials = min(min_iterations, iterations)
         return options
 
-    def fundamental(pair: Pair) -> Solution:
+    def fundamental(pair: PixelPair) -> Solution:
         if two_view:
             return _two_view(library, pair, settings(pair))
         ransac = settings(pair).ransac
@@ -56,7 +56,7 @@ def colmap(
         R, t = result["cam2_from_cam1"].rotation.matrix(), result["cam2_from_cam1"].translation
         return pairwise.posed(pair.exact, R, t, result["inlier_mask"], result["E"])
 
-    def homography(pair: Pair) -> Solution:
+    def homography(pair: PixelPair) -> Solution:
         result = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
         if result is None:
             return pairwise.without(pair)
@@ -67,7 +67,7 @@ def colmap(
     return PairwiseEstimator("COLMAP", fundamental if model == "fundamental" else homography, model=model)
 
 
-def _two_view(library: Any, pair: Pair, options: Any) -> Solution:
+def _two_view(library: Any, pair: PixelPair, options: Any) -> Solution:
     """COLMAP's two-view geometry, with F of its pose where there is one; the pose where cameras are asked for."""
     matches = np.repeat(np.arange(len(pair.x0), dtype=np.uint32)[:, None], 2, 1)
     camera0, camera1 = _cameras(library, pair)
@@ -88,7 +88,7 @@ def _two_view(library: Any, pair: Pair, options: Any) -> Solution:
     return Solution(F, inliers, np.array([np.nan if K is None else K[0, 0] for K in (K0, K1)]), R, t)
 
 
-def _cameras(library: Any, pair: Pair) -> list[Any]:
+def _cameras(library: Any, pair: PixelPair) -> list[Any]:
     """The cameras of a pair; an unknown focal length begins at COLMAP's default, for central principal points.
     Cameras of one number share an unknown focal length."""
     cameras: list[Any] = []

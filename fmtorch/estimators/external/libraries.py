@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.options import Within
 from fmtorch.estimators.external import pairwise
-from fmtorch.estimators.external.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Points, Solution
+from fmtorch.estimators.external.pairwise import Confidence, Iterations, PairwiseEstimator, PixelPair, Points, Solution
 from fmtorch.estimators.refinement import Pixels
 from fmtorch.geometry.eight_point import eight_point
 from fmtorch.geometry.pose import calibrated
@@ -41,7 +41,7 @@ def opencv(
     if code is None or not name.startswith(("FM_", "USAC_")):
         raise ValueError(f"method is {method!r}; it must be ransac, lmeds, or one of cv2's constants USAC_* or FM_*")
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         if essential is not None and pair.exact is not None:
             options = {"method": int(code), "prob": confidence, "threshold": essential, "maxIters": iterations}
             return _of_essential(pair, pair.exact, options)
@@ -51,7 +51,7 @@ def opencv(
     return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")
 
 
-def _of_essential(pair: Pair, K: tuple[Points, Points], options: Mapping[str, Any]) -> Solution:
+def _of_essential(pair: PixelPair, K: tuple[Points, Points], options: Mapping[str, Any]) -> Solution:
     rays = calibrated(pair.x0, K[0]), calibrated(pair.x1, K[1])
     E, mask = cv2.findEssentialMat(*rays, np.eye(3), **options)
     if E is None:
@@ -73,7 +73,7 @@ def weighted_eight_point(*, best: Annotated[float, Within(0, 1)] = 0.1) -> Pairw
         best: share of the matches, those of the largest P, by whose depths the pose is chosen.
     """
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         p, K = pair.likelihood, pair.exact
         weight = np.maximum(2 * p - 1, 0) / (p**2 + (1 - p) ** 2)
         if np.count_nonzero(weight) < pairwise.MIN_MATCHES:
@@ -107,7 +107,7 @@ def kornia_ransac(
 
     import kornia  # nobody else's estimator waits for it
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         estimator = kornia.geometry.RANSAC(
             "fundamental", inl_th=threshold, batch_size=batch_size, max_iter=rounds, confidence=confidence,
             prosac_sampling=prosac, seed=pair.seed,
@@ -150,7 +150,7 @@ def magsac_cpp(
     """
     number, library = _named("sampler", sampler, SAMPLERS), pairwise.peer("pymagsac", "MAGSAC++")
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         (h0, w0), (h1, w1) = pair.size0, pair.size1
         weights = pair.likelihood.tolist() if number > 2 else []
         F, inside = library.findFundamentalMatrix(
@@ -182,7 +182,7 @@ def gc_ransac_cpp(
     """
     number, library = _named("sampler", sampler, SAMPLERS), pairwise.peer("pygcransac", "GC-RANSAC")
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         weights = pair.likelihood.tolist() if number > 2 else []
         F, _ = library.findFundamentalMatrix(
             pair.joined, *pair.size0, *pair.size1, weights, threshold, confidence, coherence, iterations, 50, True,
@@ -208,7 +208,7 @@ def degensac_cpp(
     """
     library = pairwise.peer("pydegensac", "DEGENSAC")
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         F, inside = library.findFundamentalMatrix(
             pair.x0, pair.x1, threshold, confidence, iterations, seed=pair.seed % (MAX_SEED - 1) + 1
         )
@@ -239,7 +239,7 @@ def superansac_cpp(
     named = _named("sampler", sampler, SUPERANSAC_SAMPLERS), _named("score", score, SUPERANSAC_SCORES)
     library = pairwise.peer("pysuperansac", "SupeRANSAC")
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         settings = library.RANSACSettings()  # each call divides its threshold by the scale of the points
         settings.sampler = getattr(library.SamplerType, named[0])
         settings.scoring = getattr(library.ScoringType, named[1])
@@ -308,7 +308,7 @@ def poselib(
     chosen = {"loss_type": loss and loss.upper(), "loss_scale": loss_scale}
     refinement = {name: value for name, value in chosen.items() if value is not None}  # else PoseLib's own
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         seeded = {**options, "seed": pair.seed}
         if pair.exact is not None:
             return _relative_pose(library, pair, seeded, refinement)
@@ -323,7 +323,7 @@ def poselib(
     return PairwiseEstimator(name, solve, best_first=prosac)
 
 
-def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
+def _relative_pose(library: Any, pair: PixelPair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
     """The relative pose of two calibrated cameras; their lenses have no distortion."""
     assert pair.exact is not None
     cameras = [
@@ -334,7 +334,7 @@ def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement
     return pairwise.posed(pair.exact, pose.R, pose.t, info["inliers"])
 
 
-def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
+def _shared_focal(library: Any, pair: PixelPair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
     """The fundamental matrix of the relative pose and the one focal length of two images of one size."""
     centre = _centre(pair.size0)
     image_pair, info = library.estimate_shared_focal_relative_pose(pair.x0, pair.x1, centre, options, refinement)
@@ -383,7 +383,7 @@ def fastpose(
     library = pairwise.peer("fastpose", "fastpose").estimators
     options = {"iterations": iterations, "min_iterations": min(min_iterations, iterations), "success_prob": confidence}
 
-    def solve(pair: Pair) -> Solution:
+    def solve(pair: PixelPair) -> Solution:
         own: dict[str, Any] = {**options, "max_error": threshold, "seed": pair.seed % 2**32}
         if model == "homography":
             result, info = library.estimate_homography(pair.x0, pair.x1, **own)
@@ -406,7 +406,7 @@ def fastpose(
     return PairwiseEstimator("fastpose", solve, model=model)
 
 
-def _of_fastpose(pair: Pair, result: Any, info: Any, K: tuple[Points, Points], focals: Any = None) -> Solution:
+def _of_fastpose(pair: PixelPair, result: Any, info: Any, K: tuple[Points, Points], focals: Any = None) -> Solution:
     if not info["num_inliers"]:
         return pairwise.without(pair)
     return pairwise.posed(K, result["R"], result["t"], info["inliers"], focals=focals)

@@ -37,7 +37,7 @@ class Solution(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Pair:
+class PixelPair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
     likelihood: the prior where there is one, else 1 - ambiguity, else 1; matches are in its descending order if asked.
     calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; calibrated: whether
@@ -66,7 +66,7 @@ class Pair:
 
 
 class PairwiseEstimator:
-    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's matches, best first if asked.
+    """Runs a function of a `PixelPair` -> (F or None, inliers) on each pair's matches, best first if asked.
 
     Args:
         name: what it is called in reasons.
@@ -76,7 +76,11 @@ class PairwiseEstimator:
     """
 
     def __init__(
-        self, name: str, solve: Callable[[Pair], tuple[Any, ...]], best_first: bool = False, model: str = "fundamental"
+        self,
+        name: str,
+        solve: Callable[[PixelPair], tuple[Any, ...]],
+        best_first: bool = False,
+        model: str = "fundamental",
     ) -> None:
         self.name, self.model, self._solve, self._best_first = name, model, solve, best_first
 
@@ -117,7 +121,9 @@ class PairwiseEstimator:
         sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
         inside, inliers = np.zeros(len(slot), np.bool_), np.zeros(c.mask.shape[1], np.bool_)
         try:
-            solution = Solution(*self._solve(_with_cameras(Pair(x0, x1, likelihood[order], *sizes, seed), batch, i)))
+            solution = Solution(
+                *self._solve(_with_cameras(PixelPair(x0, x1, likelihood[order], *sizes, seed), batch, i))
+            )
             inside[order] = solution.inliers
         except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
             return f"{self.name} failed: {_said(failure)}"
@@ -129,7 +135,7 @@ class PairwiseEstimator:
         return reason or solution._replace(inliers=inliers)
 
 
-def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
+def _with_cameras(pair: PixelPair, batch: Batch, i: int) -> PixelPair:
     """The pair with what is known of its cameras, where they are asked for."""
     if batch.focal is None or batch.sizes.shape[1] == 0:
         return pair
@@ -186,7 +192,7 @@ def solution(F: Any, inliers: Any) -> Solution:
     return Solution(F, np.asarray(inliers, dtype=np.bool_).ravel())
 
 
-def without(pair: Pair) -> Solution:
+def without(pair: PixelPair) -> Solution:
     """No model, and no inliers."""
     return Solution(None, np.zeros(len(pair.x0), np.bool_))
 
@@ -200,7 +206,7 @@ def posed(
     return Solution(F, np.asarray(inliers, np.bool_).ravel(), focals, R, t)
 
 
-def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
+def within(F: Any, pair: PixelPair, threshold: float) -> NDArray[np.bool_]:
     """Which matches lie within a Sampson distance of F, in pixels, (N,)."""
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
     return (sampson(matrix, x0, x1) <= threshold).numpy()
