@@ -132,7 +132,7 @@ class NoFeatures:
 
 
 class WrongPart(TypeError, ValueError):
-    """What somebody's part takes or returned is of another kind than its stage's: its author can put it right."""
+    """A user's part takes or returned something that its stage does not allow: its author can put it right."""
 
 
 def called(wanted: str, part: Any, *given: Any) -> Any:
@@ -217,7 +217,7 @@ def output_of(
 
 
 def sound(estimate: Estimate, name: str) -> Estimate:
-    """The estimate of a part: pairs without a matrix are not ok, and those that are not ok alone have a reason."""
+    """The estimate of a part: pairs without a matrix are not ok, and exactly those that are not ok have a reason."""
     valid = torch.isfinite(estimate.matrix).flatten(1).all(1) & (estimate.matrix != 0).flatten(1).any(1)
     ok, claimed = (estimate.ok & valid).tolist(), estimate.ok.tolist()
     if ok == claimed and all(bool(reason) != fine for reason, fine in zip(estimate.reason, ok, strict=True)):

@@ -114,7 +114,7 @@ class Correspondences(Record):
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.
     focal: what estimators may take for known of the focal lengths of both images, (B, 2, 2): px and relative standard
     deviation (0 exact, infinite unknown), for square pixels and central principal points. shared_focal: (B,), whether
-    both are one in units of the longer sides. Without these estimates are of F alone, whatever K0 and K1 are.
+    both are one in units of the longer sides. Without these, estimates are of F alone, whatever K0 and K1 are.
     lens: what is known of the lenses of both images, (B, 2, 2): lambda of the division model and its standard deviation
     (0 exact, infinite unknown), see `fmtorch.find_fundamental`. shared_lens: (B,), whether both are one."""
 
@@ -200,8 +200,8 @@ class Estimate(Record):
     "fundamental", or "homography" for `x1 ~ H x0`, which is positive where the plane is seen.
 
     Where cameras are known or asked for, NaN if not determined: focals (B, 2), px; X1 = R X0 + t, t of unit length;
-    E = [t]_x R. fit_scale: (B,), the Sampson distance of a usual match from which on it did not count in the final fit,
-    px. focal_precision: (B, 2, 2), the second derivatives of the prior's cost by the logarithms of the focal lengths,
+    E = [t]_x R. fit_scale: (B,), the Sampson distance beyond which a match of usual noise did not count in the final
+    fit, px. focal_precision: (B, 2, 2), second derivatives of the prior's cost in the logarithms of the focal lengths,
     infinite on the diagonal where these are exact.
 
     Where the covariance is asked for: covariance (B, 7, 7) of (rotation vector omega of ``exp([omega]x) R``, tau,
@@ -212,8 +212,8 @@ class Estimate(Record):
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
     NaN where there is none.
 
-    Where image sizes are not given and may be assumed: sizes (B, 2, 2), (h, w) of both images as the points tell them,
-    NaN where these tell none; sizes_doubtful (B,), whether images of one size and of two were both likely.
+    Where image sizes are not given and may be assumed: sizes (B, 2, 2), (h, w) of both images as inferred from
+    the points, NaN where they cannot be; sizes_doubtful (B,), whether images of one size and of two were both likely.
 
     Where lenses are estimated: lens (B, 2), lambda of both, NaN where they are not determined.
     Where pinholes are assumed: lens_suggested (B,), lambda of one lens for both images with which the matches agree
@@ -274,7 +274,7 @@ class Estimate(Record):
     @property
     def related(self) -> Bool[Tensor, " b"]:
         """Whether the two images are taken to show one scene: ok, with a significance of at least `RELATED`.
-        Recall and all other figures are of `ok` alone; this tells whom to believe."""
+        Recall and all other metrics use `ok` alone; this says which estimates to believe."""
         return self.ok & (cast(Tensor, self.significance) >= RELATED)
 
     @property
@@ -287,8 +287,7 @@ class Estimate(Record):
     @property
     def warning(self) -> tuple[str, ...]:
         """What the type of each pair leaves open, whether its matches contradict its calibration matrices or pinholes,
-        and which sizes were doubtful.
-        Empty where there is nothing to say."""
+        and which sizes were doubtful. Empty where there is nothing to say."""
         lens, unknown = self.lens_suggested, self.pair_type_index is None
         opens = [""] * len(self) if unknown else [WARNINGS[name] for name in self.pair_type]
         contradicted = [False] * len(self) if self.contradicted is None else self.contradicted.tolist()

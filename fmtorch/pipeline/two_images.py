@@ -41,8 +41,8 @@ class MatchResult:
     correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
     F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
     significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
-    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step, cached features with those they took when they were computed.
+    warning: why F, though found, means little; usually empty. counts: matches after each step, in order. seconds: of
+    each step; of cached features, those they took when they were computed.
     R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
     photographs, where cameras were asked for; NaN where not determined.
     pair_type: one of `PAIR_TYPES`; empty where nothing could be matched. geometry: the two-view geometry for

@@ -58,11 +58,11 @@ def find_fundamental(
         x0, x1: matched points in pixels, NumPy or torch, on any device: (N, 2) for one pair, (B, N, 2) for a padded
             batch, or a list of (N, 2) for pairs of different lengths. Gradients reach them through the final fit.
         estimator: a preset of conf/estimator.
-        mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
-            the leading B for one pair, and comes as a list where the points do.
+        mask: (B, N), True for real matches; all when not given. Like every argument for matches it may lack the
+            leading B for one pair, and is a list where the points are.
         ratio: (B, N), the distance of the nearest descriptor over that of the second nearest, smaller is better.
         score: (B, N), the matcher's confidence in [0, 1], larger is better, NaN as 0; used where there is no ratio.
-            Whether it is a probability, as LightGlue's, the matches of each pair tell; `fmtorch` ignores others.
+            The matches of each pair tell whether it is a probability, like LightGlue's; if not, `fmtorch` ignores it.
         prior: (B, N), P(inlier) in [0, 1], NaN as 0. Where an estimator uses a prior and none is given, it is derived
             from the frames and the ratio, if known, otherwise from the points and the ratio or score, if known.
         lafs0, lafs1: (B, N, 2, 3) local affine frames.
@@ -72,8 +72,8 @@ def find_fundamental(
             unless these are centred; "unknown" assumes nothing.
         K0, K1: calibration matrices, px, (3, 3) for all pairs or (B, 3, 3), of both images or of one. Gradients reach
             them.
-        focal: what else is known of the focal lengths, for square pixels and a central principal point where there is
-            no K, and with `size0` and `size1` there:
+        focal: what else is known of the focal lengths; without K, it implies square pixels and a central principal
+            point, and needs `size0` and `size1`:
 
             ================================  ======================================================================
             None                              K0 and K1 are exact; without them usual focal lengths are likely
@@ -91,15 +91,15 @@ def find_fundamental(
             in half diagonals of the image: -0.05 of a usual phone at its wide end, -0.3 of an action camera. None: not
             at all; "shared": one unknown lambda, "unknown": one for each image; lambda, exactly; (lambda, s) up to a
             standard deviation s; ((lambda0, s0), (lambda1, s1)) or (B, 2, 2) for each image, None in place of an
-            unknown one. Points and inliers are of the photographs, F, E and the pose of the pixels of pinholes. With
+            unknown one. Points and inliers are in pixels of the photographs; F, E and pose, in undistorted ones. With
             K0 or K1 it needs the image sizes. Calibrated lenses are `fmtorch.Lens`, for both images, (lens0, lens1)
             with None for a pinhole, or a list of (lens0, lens1), one for each pair: matches are judged in pixels of the
-            photographs, also what fish-eyes see beyond 90 degrees of their axis; the K of a lens stands for K0 or K1.
+            photographs, even over 90 degrees off the axis of a fish-eye; the K of a lens replaces K0 or K1.
             Gradients are zero where an estimated or exact lambda is not zero and no plausible cameras agree with the
             matches.
-        covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
-            said of the cameras these are as of ``focal="unknown"``.
-        pair_type: whether it has the type of each pair: general, planar, rotation, identical, unrelated.
+        covariance: whether to compute the covariance, which needs K0 and K1 or the image sizes. Where nothing is
+            said of the cameras, ``focal="unknown"`` is assumed.
+        pair_type: whether to determine the type of each pair: general, planar, rotation, identical, unrelated.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -188,8 +188,8 @@ def find_essential(
     """Robustly estimate the relative pose of two calibrated cameras: ``X1 = R X0 + t`` and ``E = [t]_x R``.
 
     Args:
-        x0, x1: matched points in pixels, as of `find_fundamental`; or normalised ones, with K the identity, of which
-            thresholds count as pixels of a camera with a focal length of 1000 px.
+        x0, x1: matched points in pixels, as for `find_fundamental`; or normalised ones, with K the identity, for which
+            thresholds are in pixels of a camera with a focal length of 1000 px.
         K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
             square nor principal points central. None where `lens` has a calibrated one of that image.
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
@@ -246,14 +246,14 @@ def find_homography(
     """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
 
     Args:
-        x0, x1: matched points in pixels, as of `find_fundamental`. x0 may be in the unit of a plane with y up or down:
-            where its extent is another one, it is scaled to that of x1, in whose pixels thresholds are. Gradients reach
-            the points through the final fit.
+        x0, x1: matched points in pixels, as for `find_fundamental`. x0 may be in the unit of a plane, with y up or
+            down: if its extent differs much from that of x1, it is scaled to it; thresholds are in pixels of x1.
+            Gradients reach the points through the final fit.
         estimator: a preset of conf/estimator whose solver is `four_point`.
         mask, ratio, score, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2), in whose half diagonals lambda is.
         lens: calibrated lenses, "shared", "unknown", or lambda, exactly, as of `find_fundamental`. H is of the pixels
-            of pinholes. What is unknown is zero unless the matches have greater evidence of a lens; then there are no
+            of pinholes. An unknown lambda is zero unless the matches favour a lens; then there are no
             gradients.
         options: replace values of the preset (``inlier_threshold=1.5``).
 

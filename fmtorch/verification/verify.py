@@ -327,21 +327,21 @@ def verify(
         features, matches: hloc's two files in place of a database. They know no cameras; "stored" is "unknown" then.
             matches alone: an npz or HDF5 file of x0, x1 (n, 2), pixels, and perhaps K0, K1 (3, 3), size0, size1 (h, w),
             of one pair or of each pair below its name (``a/x0``). Without K and sizes a pair has F and H, but no pose.
-        output: a new database to write to instead; it gets this name once it is complete, and is left as it is where it
-            has all pairs. Of hloc's files a new file of matches, those that are inliers, with the matrices as
-            attributes. Of matches alone an npz or HDF5 file of each pair's `configuration`, `inliers` (n,), and F, E,
+        output: a new database to write to instead; it gets this name once it is complete; one that has all pairs is
+            left as it is. For hloc's files, a new file of the matches that are inliers, with the matrices as
+            attributes. For matches alone, an npz or HDF5 file of each pair's `configuration`, `inliers` (n,), and F, E,
             H, R, t, `reason` and `warning` as far as it has them.
         cameras: "stored": points are undistorted, focal lengths are exact where the camera was calibrated, known within
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
             units of the longer side, without distortion. "unknown": nothing is known.
         lens: as of `find_fundamental`: how much photographs bend straight lines, where the stored cameras do not. The
-            matrices are then of the images without that, the inliers of the photographs.
+            matrices then relate undistorted points; the inliers are those of the photographs.
         estimator: a preset of conf/estimator.
         force: estimate pairs that have a geometry as well, and replace an existing `output`.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, as of `find_fundamental`.
-        report: called with the pairs done and their number, at the start and after each batch.
+        report: called with the numbers of pairs done and of all pairs, at the start and after each batch.
         execution: by which workers, ``fmtorch.jobs.Execution("processes", 4)`` say; None: threads of the estimator.
         shard: "2/8" for the second eighth of the pairs. A call without it estimates what is missing and writes all.
         options: replace values of the preset (``inlier_threshold=1.0``).

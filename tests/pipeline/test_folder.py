@@ -76,7 +76,7 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(pipeline, images, 
             matches = work(pipeline, images, tmp_path / name, workers=workers)
             assert len(list(matches.each(pairs))) == matches.done == len(pairs)
             assert matches.troubles == []
-    assert Counter(executor.calls) == {"Photograph": 4, "DescribedPair": 6}
+    assert Counter(executor.calls) == {"ImageToDescribe": 4, "DescribedPair": 6}
     assert len(kept(tmp_path / "one")) == 10
     for name in ("three", "own"):
         np.testing.assert_equal(kept(tmp_path / name), kept(tmp_path / "one"))
