@@ -2,8 +2,7 @@
 
 1. Padding is invisible: garbage or NaN in masked slots changes nothing.
 2. Neighbours are invisible: a pair's result does not depend on the batch it is in (bit-equal).
-3. No pair can take its batch down: degenerate pairs are told apart and leave the others alone.
-"""
+3. No pair can take its batch down: degenerate pairs are told apart and leave the others alone."""
 
 import dataclasses
 import functools

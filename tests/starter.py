@@ -4,8 +4,7 @@ It has also done what each command does first and always alike, see `warm_up`.
 
 Lines of JSON come in on standard input: ``{"start": [module or -c, arguments ...], "cwd": ..., "log": ...,
 "errors": ..., "environment": {...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit
-status. What is forked runs a module as ``python -m`` does, or what follows ``-c``, after the code.
-"""
+status. What is forked runs a module as ``python -m`` does, or what follows ``-c``, after the code."""
 
 import contextlib
 import importlib

@@ -2,8 +2,7 @@
 
 A function of the C library or a vector library (exp, log, pow) is right to some ulps, which differ between versions and
 processors; a sum differs where BLAS or LAPACK chooses its order. `fmtorch.geometry.arithmetic` and `arithmetic_kernels`
-stand for them.
-"""
+stand for them."""
 
 import ast
 from collections.abc import Iterable

@@ -1,8 +1,7 @@
 """The same bits on an older processor: code for one with AVX2 and FMA but without AVX-512, in kernels and libraries.
 
 The other process compiles kernels for Haswell, which are kept beside those of this processor, and has torch, MKL and
-NumPy take their code for AVX2. docs/concepts/conventions.md says what is promised.
-"""
+NumPy take their code for AVX2. docs/concepts/conventions.md says what is promised."""
 
 import os
 import platform

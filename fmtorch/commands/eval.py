@@ -113,12 +113,10 @@ def _pairs_of(dataset: PairDataset) -> list[ImagePair]:
             raise ValueError(f"{kind}[{i}]: image0 is a {type(pair.image0).__name__}; images are ImageSource")
     ends: dict[str, tuple[ImageSource, ImageSource]] = {}
     twice = [p.identity for p in pairs if ends.setdefault(p.identity, (p.image0, p.image1)) != (p.image0, p.image1)]
-    if twice or not pairs:
-        raise ValueError(
-            f"{kind} has two pairs of the identity {twice[0]!r}"
-            if twice
-            else f"the data set {dataset.name} has no pairs"
-        )
+    if twice:
+        raise ValueError(f"{kind} has two pairs of the identity {twice[0]!r}")
+    if not pairs:
+        raise ValueError(f"the data set {dataset.name} has no pairs")
     return [p if p.problem or _has_truth(p) else dataclasses.replace(p, problem=NO_TRUTH) for p in pairs]
 
 

@@ -59,6 +59,9 @@ class Optimisation:
     steps: Count = option(2500, "in all")
     decay: Probability = option(0.5, "share of the steps, at the end, over which the learning rate falls to zero")
 
+    def __post_init__(self) -> None:
+        expect_options(type(self), vars(self), "optimisation")
+
     def factor(self, step: int) -> float:
         """What the learning rate is multiplied by at a step."""
         return min(1.0, max((self.steps - step) / max(self.decay * self.steps, 1), 0.0))

@@ -1,8 +1,7 @@
 """Every command in the fenced blocks of README.md and docs/ runs, on data and with sizes as small as they can be.
 
 A command runs as it stands there, but for the words that `smaller` exchanges; a command that no rule knows fails. Those
-that take long run with ``-m slow``.
-"""
+that take long run with ``-m slow``."""
 
 import contextlib
 import importlib.util

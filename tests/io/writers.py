@@ -1,8 +1,7 @@
 """Matches of synthetic scenes in the layouts of others, written from their published descriptions.
 
 hloc: hloc/extract_features.py, match_features.py. RANSAC tutorial: parse_EF_data.ipynb. PoseBench: relative_pose.py.
-OANet: dump_match/datasets.py and core/data.py. glue-factory: utils/export_predictions.py. vismatch: base_matcher.py.
-"""
+OANet: dump_match/datasets.py and core/data.py. glue-factory: utils/export_predictions.py. vismatch: base_matcher.py."""
 
 from collections.abc import Callable
 from pathlib import Path

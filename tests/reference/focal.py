@@ -4,8 +4,7 @@ Parameters: a rotation vector, the direction of the translation and two log foca
 0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
 ``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``, for images of one
 size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length plus ``z^2 / 2``, or
-``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``.
-"""
+``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,6 @@
 """Homographies of samples and of all matches, parallax and Sampson errors, one problem at a time, by NumPy's SVD.
 
-H may be complex, so derivatives are exact: that of f by h along v is ``Im f(h + i t v) / t`` for a tiny t.
-"""
+H may be complex, so derivatives are exact: that of f by h along v is ``Im f(h + i t v) / t`` for a tiny t."""
 
 from collections.abc import Callable
 from typing import cast

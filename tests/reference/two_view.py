@@ -1,8 +1,7 @@
 """A two-view fit and its covariance from the definitions, one pair at a time, with numeric derivatives.
 
 Parameters (7,) are a rotation vector that multiplies R from the left, two along unit tangents of t, and what is
-added to the logarithms of both focal lengths.
-"""
+added to the logarithms of both focal lengths."""
 
 import dataclasses
 import functools

@@ -2,8 +2,7 @@
 
 ``python -m tests.reliability.generated [--calls 10] [name ...]`` makes so many calls of each subject whose name begins
 with one of the names. It is a program of its own since the test suite checks the shapes of all functions, which users
-do not have. The calls are the same every time.
-"""
+do not have. The calls are the same every time."""
 
 import argparse
 import faulthandler

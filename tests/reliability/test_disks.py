@@ -1,8 +1,7 @@
 """Disks that are full, folders that may not be written, two writers at once: one line that says so, no row lost.
 
 Rights do not bind an administrator, as whom tests often run; so folders that cannot be written are file systems mounted
-read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped.
-"""
+read-only, and files that stand in the place of folders. Where nothing may be mounted those tests are skipped."""
 
 import contextlib
 import subprocess

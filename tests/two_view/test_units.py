@@ -307,6 +307,17 @@ def test_one_unknown_lens(lens: float) -> None:
     assert all(abs(division.sampson(F, x, (SIZE, SIZE), (lens, lens))) < 2.5 for x in np.c_[x0, x1][inliers])
 
 
+@pytest.mark.parametrize(("lens", "fewest", "most", "below"), [(-0.3, 0, 3, -0.2), (0.0, 19, 24, 0.01)])
+def test_few_matches_have_a_lens_where_there_is_a_strong_one(lens, fewest, most, below) -> None:
+    """24 pairs of 50 matches, half of them wrong: how many are straight. With a prior about 0 it is 5 and 17."""
+    pairs = [division.photographs(seed, (lens, lens), noise=1.0, wrong=0.5) for seed in range(24)]
+    chosen = [np.random.default_rng(seed).permutation(len(pair[0]))[:50] for seed, pair in enumerate(pairs)]
+    both = ([pair[i][own] for pair, own in zip(pairs, chosen, strict=True)] for i in range(2))
+    estimated = found(*both, lens="shared").lens[:, 0]
+    assert fewest <= int((estimated == 0).sum()) <= most
+    assert float(estimated.nanmedian()) < below
+
+
 def test_nine_exact_matches_have_the_estimated_lens() -> None:
     """Fitzgibbon's solver, on samples of the same matches: exact ones tell lambda, noisy ones far worse than all."""
     rng, nearest, own = np.random.default_rng(0), [], []

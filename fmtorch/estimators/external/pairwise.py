@@ -119,11 +119,10 @@ class PairwiseEstimator:
         order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
         x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
         sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
+        given = _with_cameras(PixelPair(x0, x1, likelihood[order], *sizes, seed), batch, i)
         inside, inliers = np.zeros(len(slot), np.bool_), np.zeros(c.mask.shape[1], np.bool_)
         try:
-            solution = Solution(
-                *self._solve(_with_cameras(PixelPair(x0, x1, likelihood[order], *sizes, seed), batch, i))
-            )
+            solution = Solution(*self._solve(given))
             inside[order] = solution.inliers
         except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
             return f"{self.name} failed: {_said(failure)}"
